@@ -1,0 +1,256 @@
+"""Scripted demonstrators for robosuite's Lift and Can: they see the observation vector alone and act through OSC_POSE."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# Action units per unit of error: one unit of action settles at 0.306 m/s and 3.06 rad/s (stiffness 150, critically damped).
+METRES_PER_SECOND = 0.306
+RADIANS_PER_SECOND = 3.06
+
+OPEN, CLOSE = -1.0, 1.0
+FINGERS_STILL = 4e-4  # metres per step
+DOWNWARD = np.array([1.0, 0.0, 0.0, 0.0])  # hand pointing down, as x y z w
+CAN_BIN_CENTRE = np.array([0.1975, 0.405])  # metres: the compartment of the target bin that is the can's
+CAN_CLEARANCE = 0.955  # metres: a can this high passes over the bins' walls
+CAN_REST_HEIGHT = 0.86  # metres: of a can standing in its bin
+
+
+@dataclass(frozen=True)
+class Manner:
+    """
+    How one person would do one episode.
+
+    :param speed: largest action magnitude of a free movement
+    :param time_constant: of the final approach to a point, seconds
+    :param agility: largest change of an action from step to step
+    :param hover_height: above the object, metres
+    :param hover_tolerance: horizontal distance at which the descent starts, metres
+    :param hover_offset: (2,) where the hover point lies beside the object, metres
+    :param grasp_offset: (3,) of the grasp point from the object's centre, metres
+    :param grasp_tolerance: distance from the grasp point at which the fingers close, metres
+    :param dwell: steps between fingers at rest and the lift
+    :param lift_drift: (2,) sideways share of the lift's direction
+    :param carry_height: of the object above the walls, metres
+    :param release_offset: (2,) of the place of release from the compartment's centre, metres
+    :param release_tolerance: distance from that place at which the fingers open, metres
+    :param noise: standard deviation of the unsteadiness of the hand, action units
+    :param noise_memory: its correlation from step to step
+    """
+
+    speed: float
+    time_constant: float
+    agility: float
+    hover_height: float
+    hover_tolerance: float
+    hover_offset: np.ndarray
+    grasp_offset: np.ndarray
+    grasp_tolerance: float
+    dwell: int
+    lift_drift: np.ndarray
+    carry_height: float
+    release_offset: np.ndarray
+    release_tolerance: float
+    noise: float
+    noise_memory: float
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator) -> "Manner":
+        return cls(
+            speed=rng.uniform(0.6, 1.1),
+            time_constant=rng.uniform(0.14, 0.24),
+            agility=rng.uniform(0.2, 0.4),
+            hover_height=rng.uniform(0.05, 0.09),
+            hover_tolerance=rng.uniform(0.015, 0.025),
+            hover_offset=rng.normal(0.0, 0.006, 2),
+            grasp_offset=rng.normal(0.0, (0.003, 0.003, 0.003)),
+            grasp_tolerance=rng.uniform(0.007, 0.011),
+            dwell=int(rng.integers(0, 3)),
+            lift_drift=rng.normal(0.0, 0.1, 2),
+            carry_height=rng.uniform(0.01, 0.05),
+            release_offset=rng.normal(0.0, 0.01, 2),
+            release_tolerance=rng.uniform(0.025, 0.045),
+            noise=rng.uniform(0.05, 0.13),
+            noise_memory=rng.uniform(0.7, 0.9),
+        )
+
+
+class Demonstrator:
+    """
+    Hover above the object, descend, grasp; what follows is the task's.
+
+    A grasp that closes on nothing, or an object lost on the way, leads back to the hover point.
+
+    :param seed: of everything random; the same seed and observations give the same actions
+    """
+
+    object_columns = slice(9, 12)  # where the observation holds the object's position
+    smallest_grip = 0.012  # metres from the middle to a finger: closed further, it holds nothing
+    grasp_height = 0.0  # metres above the object's centre
+
+    def __init__(self, seed: int | np.random.SeedSequence | None = None) -> None:
+        self._rng = np.random.default_rng(seed)
+        self.reset()
+
+    def reset(self) -> None:
+        """Start another episode in another manner."""
+        self.manner = Manner.draw(self._rng)
+        self.stage = "hover"
+        self._steps_in_stage = 0
+        self._movement = np.zeros(6)
+        self._unsteadiness = np.zeros(6)
+        self._fingers = 0.0
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """
+        The next action.
+
+        :param observation: (19,) for Lift, (23,) for Can
+        :return: (7,) float32 in [-1, 1]
+        """
+        observation = np.asarray(observation, np.float64)
+        hand, orientation = observation[:3], observation[3:7]
+        fingers = float(observation[7] - observation[8]) / 2.0
+        finger_speed, self._fingers = abs(fingers - self._fingers), fingers
+        stage = self._next_stage(hand, observation[self.object_columns], fingers, finger_speed)
+        self._steps_in_stage = self._steps_in_stage + 1 if stage == self.stage else 0
+        self.stage = stage
+        target, gripper = self._target(hand, observation[self.object_columns])
+        return self._move(target - hand, _rotation_between(orientation, DOWNWARD), gripper)
+
+    def _next_stage(self, hand: np.ndarray, position: np.ndarray, fingers: float, finger_speed: float) -> str:
+        manner = self.manner
+        to_grasp = self._grasp_point(position) - hand
+        aside = float(np.hypot(*to_grasp[:2]))
+        if self.stage == "hover" and aside < manner.hover_tolerance + float(np.hypot(*manner.hover_offset)):
+            return "descend"
+        if self.stage == "descend":
+            if aside > 0.04:
+                return "hover"
+            if np.linalg.norm(to_grasp) < manner.grasp_tolerance and fingers > 0.03:
+                return "grasp"
+        if self.stage == "grasp" and self._steps_in_stage >= 3 + manner.dwell and finger_speed < FINGERS_STILL:
+            return self._after_grasp() if fingers > self.smallest_grip else "hover"
+        if self.stage not in ("hover", "descend", "grasp"):
+            return self._next_stage_holding(hand, position, fingers)
+        return self.stage
+
+    def _target(self, hand: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, float]:
+        """Where the hand should go, (3,) metres, and the gripper's command."""
+        grasp_point = self._grasp_point(position)
+        if self.stage == "hover":
+            # Comes down on a slope, so that the hand arrives over the object and at hover height together.
+            aside = float(np.hypot(*(grasp_point - hand)[:2]))
+            height = self.manner.hover_height + 0.5 * aside
+            return grasp_point + np.array([*self.manner.hover_offset, height]), OPEN
+        if self.stage == "descend":
+            return grasp_point, OPEN
+        if self.stage == "grasp":
+            return grasp_point, CLOSE
+        return self._target_holding(hand, position)
+
+    def _grasp_point(self, position: np.ndarray) -> np.ndarray:
+        return position + self.manner.grasp_offset + np.array([0.0, 0.0, self.grasp_height])
+
+    def _after_grasp(self) -> str:
+        raise NotImplementedError
+
+    def _next_stage_holding(self, hand: np.ndarray, position: np.ndarray, fingers: float) -> str:
+        raise NotImplementedError
+
+    def _target_holding(self, hand: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, float]:
+        raise NotImplementedError
+
+    def _move(self, offset: np.ndarray, rotation: np.ndarray, gripper: float) -> np.ndarray:
+        """
+        Towards a pose, smoothly and with an unsteady hand.
+
+        :param offset: (3,) metres to go
+        :param rotation: (3,) axis-angle to turn, radians
+        :param gripper: command
+        """
+        manner = self.manner
+        wanted = np.empty(6)
+        wanted[:3] = offset / (METRES_PER_SECOND * manner.time_constant)
+        wanted[:3] *= min(1.0, manner.speed / max(float(np.linalg.norm(wanted[:3])), 1e-9))
+        wanted[3:] = np.clip(rotation / (RADIANS_PER_SECOND * 2.0 * manner.time_constant), -0.1, 0.1)
+        self._movement += np.clip(wanted - self._movement, -manner.agility, manner.agility)
+        fresh = np.sqrt(1.0 - manner.noise_memory**2) * self._rng.normal(size=6)
+        self._unsteadiness = manner.noise_memory * self._unsteadiness + fresh
+        # A hand in motion shakes more than one that aims, and turns less than it shifts.
+        effort = 0.3 + 0.7 * float(np.linalg.norm(self._movement[:3])) / manner.speed
+        noise = manner.noise * effort * np.array([1.0, 1.0, 1.0, 0.2, 0.2, 0.2]) * self._unsteadiness
+        action = np.append(self._movement + noise, gripper)
+        return np.clip(action, -1.0, 1.0).astype(np.float32)
+
+
+class LiftDemonstrator(Demonstrator):
+    """Grasps the cube and lifts it off the table."""
+
+    def _after_grasp(self) -> str:
+        return "lift"
+
+    def _next_stage_holding(self, hand: np.ndarray, position: np.ndarray, fingers: float) -> str:
+        lost = fingers < self.smallest_grip or np.linalg.norm(position - hand) > 0.05
+        return "hover" if lost else self.stage
+
+    def _target_holding(self, hand: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, float]:
+        return hand + 0.1 * np.array([*self.manner.lift_drift, 1.0]), CLOSE
+
+
+class CanDemonstrator(Demonstrator):
+    """Grasps the can, raises it over the wall, carries it to its compartment and lets go."""
+
+    object_columns = slice(16, 19)
+    grasp_height = 0.015
+
+    def _after_grasp(self) -> str:
+        return "raise"
+
+    def _next_stage_holding(self, hand: np.ndarray, position: np.ndarray, fingers: float) -> str:
+        manner = self.manner
+        if self.stage == "release":
+            fallen_outside = self._steps_in_stage > 15
+            return "hover" if fallen_outside else "release"
+        if fingers < self.smallest_grip or np.linalg.norm(position - hand) > 0.07:
+            return "hover"
+        if self.stage == "raise" and position[2] > CAN_CLEARANCE:
+            return "carry"
+        aside = float(np.hypot(*(self._release_point() - position[:2])))
+        if self.stage == "carry" and aside < manner.release_tolerance:
+            return "release"
+        return self.stage
+
+    def _target_holding(self, hand: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, float]:
+        height = CAN_CLEARANCE + self.manner.carry_height
+        if self.stage == "raise":
+            # Leans towards the target while rising, the more the higher the can already is.
+            risen = np.clip((position[2] - CAN_REST_HEIGHT) / (CAN_CLEARANCE - CAN_REST_HEIGHT), 0.0, 1.0)
+            sideways = 0.15 * risen * (self._release_point() - position[:2])
+            return hand + np.array([*sideways, height + 0.02 - position[2]]), CLOSE
+        if self.stage == "carry":
+            return hand + np.array([*self._release_point(), height]) - position, CLOSE
+        return hand + np.array([0.0, 0.0, 0.01]), OPEN
+
+    def _release_point(self) -> np.ndarray:
+        return CAN_BIN_CENTRE + self.manner.release_offset
+
+
+DEMONSTRATORS: dict[str, type[Demonstrator]] = {"Lift": LiftDemonstrator, "Can": CanDemonstrator}
+
+
+def _rotation_between(quaternion: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """
+    Axis-angle rotation in the world's frame that turns one orientation into another.
+
+    :param quaternion: (4,) x y z w
+    :param goal: (4,) x y z w
+    :return: (3,) radians
+    """
+    vector, scalar = -quaternion[:3], quaternion[3]  # of the inverse
+    turned = goal[3] * vector + scalar * goal[:3] + np.cross(goal[:3], vector)
+    cosine = float(goal[3] * scalar - goal[:3] @ vector)
+    if cosine < 0.0:
+        turned, cosine = -turned, -cosine
+    sine = float(np.linalg.norm(turned))
+    return turned * (2.0 * np.arctan2(sine, cosine) / max(sine, 1e-9))

@@ -1,0 +1,138 @@
+"""The wrapper that shows a sequence policy its target return and its time step, and the spaces that come with it."""
+
+import math
+from typing import Any, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
+
+OBSERVATION = "observation"
+RETURN_TO_GO = "return_to_go"
+TIMESTEP = "timestep"
+
+
+def sort_observation_space(space: spaces.Space) -> spaces.Space:
+    """
+    The same space with the keys of every Dict in sorted order, at any depth.
+
+    A Dict space may keep the order it was built with, and that order is lost on the way through a dataset's file.
+    Sorted, an environment and its recordings flatten alike.
+
+    :raises ValueError: a part of the space is an image or has no fixed number of entries
+    """
+    if isinstance(space, spaces.Dict):
+        return spaces.Dict({key: sort_observation_space(part) for key, part in space.spaces.items()})
+    if isinstance(space, spaces.Tuple):
+        return spaces.Tuple([sort_observation_space(part) for part in space.spaces])
+    if isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) > 1:
+        raise ValueError(f"Observation space {space} holds an image; only vectors of numbers can be used.")
+    if not isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
+        raise ValueError(
+            f"Observation space {space} cannot be flattened to a Box; "
+            "accepted are Box, Discrete, MultiDiscrete, MultiBinary, and Dict and Tuple of these."
+        )
+    return space
+
+
+def flatten_observation_space(space: spaces.Space) -> spaces.Box:
+    """
+    The vector that observations of a space become: Dict entries one after the other by sorted key.
+
+    :param space: an environment's observation space
+    :return: Box (O,) float32 with the bounds of `space`
+    :raises ValueError: the space holds an image or has no fixed number of entries
+    """
+    flat = spaces.flatten_space(sort_observation_space(space))
+    if not isinstance(flat, spaces.Box) or len(flat.shape) != 1 or flat.shape[0] == 0:
+        raise ValueError(f"Observation space {space} cannot be flattened to a Box of at least one entry.")
+    with np.errstate(over="ignore"):
+        return spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
+
+
+def return_to_go_space(observation_space: spaces.Space) -> spaces.Dict:
+    """
+    What a sequence policy observes, for an environment or for a dataset.
+
+    :param observation_space: of the bare environment, or the flat one of a dataset's buffer
+    :return: Dict of `observation` (O,) float32, `return_to_go` (1,) float32, `timestep` (1,) int64
+    :raises ValueError: `observation_space` cannot be flattened
+    """
+    return spaces.Dict(
+        {
+            OBSERVATION: flatten_observation_space(observation_space),
+            RETURN_TO_GO: spaces.Box(-np.inf, np.inf, (1,), np.float32),
+            # Box.sample adds one to the bound, which overflows at the largest int64.
+            TIMESTEP: spaces.Box(0, np.iinfo(np.int32).max, (1,), np.int64),
+        }
+    )
+
+
+def check_target_return(target_return: float) -> float:
+    """
+    :param target_return: environment reward units
+    :raises ValueError: not a finite number
+    """
+    if isinstance(target_return, bool | str | bytes):
+        raise ValueError(f"target_return must be a finite number, got {target_return!r}.")
+    try:
+        value = float(target_return)
+    except TypeError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"target_return must be a finite number, got {target_return!r}.")
+    return value
+
+
+class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """
+    Adds to each observation the return still to reach and the time step.
+
+    The return-to-go starts at the target and loses each reward: g(0) = target, g(t+1) = g(t) - r(t). It is counted in
+    float64 and shown as float32, in environment reward units; scaling is the policy's business. A Dict observation
+    (goal-conditioned tasks, for example) is flattened to one vector, see :func:`flatten_observation_space`.
+
+    :param env: the environment to wrap
+    :param target_return: return to ask for in each episode, environment reward units
+    :raises ValueError: `target_return` is not a finite number, or the observation space cannot be flattened
+    """
+
+    def __init__(self, env: gym.Env, target_return: float) -> None:
+        RecordConstructorArgs.__init__(self, target_return=target_return)
+        super().__init__(env)
+        self.target_return = check_target_return(target_return)
+        self.observation_space = return_to_go_space(env.observation_space)
+        self._sorted_space = sort_observation_space(env.observation_space)
+        self._return_to_go = self.target_return
+        self._timestep = 0
+
+    def set_target_return(self, target_return: float) -> None:
+        """
+        Ask for another return from the next reset on; also through ``VecEnv.env_method("set_target_return", value)``.
+
+        :param target_return: environment reward units
+        :raises ValueError: not a finite number
+        """
+        self.target_return = check_target_return(target_return)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._return_to_go = self.target_return
+        self._timestep = 0
+        return self._observe(observation), info
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._return_to_go -= float(reward)
+        self._timestep += 1
+        return self._observe(observation), reward, terminated, truncated, info
+
+    def _observe(self, observation: Any) -> dict[str, np.ndarray]:
+        return {
+            OBSERVATION: np.asarray(spaces.flatten(self._sorted_space, observation)).astype(np.float32),
+            RETURN_TO_GO: np.array([self._return_to_go], dtype=np.float32),
+            TIMESTEP: np.array([self._timestep], dtype=np.int64),
+        }

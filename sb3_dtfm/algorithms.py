@@ -1,0 +1,468 @@
+"""`DT` and `DTFM`: one offline learn loop, two policies."""
+
+import math
+import time
+from os import PathLike
+from typing import Any, ClassVar, TypeVar
+
+import minari
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import configure_logger, update_learning_rate
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, is_vecenv_wrapped, unwrap_vec_normalize
+
+from sb3_dtfm.callbacks import GradientStepProgressBar, NormalizedScoreCallback, find_eval_callbacks
+from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer, load_dataset
+from sb3_dtfm.envs import return_to_go_space
+from sb3_dtfm.policies import DTFMPolicy, DTPolicy, SequencePolicy
+
+SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineSequenceAlgorithm")
+Dataset = str | PathLike[str] | minari.MinariDataset | TrajectoryBuffer
+
+LEARNING_RATE_SCHEDULES = ("constant", "linear", "cosine")
+PRECISIONS = ("auto", "float32", "bfloat16")
+
+
+class OfflineSequenceAlgorithm(BaseAlgorithm):
+    """
+    Learn a sequence policy from recorded episodes: `learn(total_timesteps)` counts gradient steps.
+
+    :param policy: "MultiInputPolicy" or a policy class
+    :param env: environment wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`; optional, never used for learning
+    :param dataset: Minari id or dataset, path to a robomimic hdf5 file, or a :class:`~sb3_dtfm.data.TrajectoryBuffer`
+    :param learning_rate: AdamW's, a number or a function of the progress remaining (from 1 to 0)
+    :param batch_size: windows in a gradient step
+    :param weight_decay: AdamW's, on weight matrices only
+    :param context_length: K, steps the policy sees
+    :param dataset_fraction: share of the episodes to learn from, randomly drawn
+    :param dataset_seed: seed of that draw alone, so that different runs learn from the same episodes
+    :param dataset_kwargs: further arguments of the reader, for example `{"filter_key": "train"}` for robomimic
+    :param max_grad_norm: clip the gradient's norm to this; None does not clip
+    :param warmup_steps: gradient steps over which the learning rate rises linearly from zero
+    :param learning_rate_schedule: factor on the learning rate: "constant", or "linear" or "cosine" down to zero
+    :param ema_decay: decay of the exponential moving average of weights that acts; 0 acts with the trained weights
+    :param precision: "float32", "bfloat16" (autocast), or "auto": bfloat16 where the hardware multiplies in it
+    :param policy_kwargs: arguments of the policy, for example `embed_dim`, `n_layers`, `n_heads`, `dropout`
+    :param stats_window_size: as in SB3; offline learning collects no episodes
+    :param tensorboard_log: folder of the TensorBoard log, None for no log
+    :param verbose: 0 silent, 1 prints the log
+    :param seed: seed of weights, batches and acting
+    :param device: "auto", "cpu" or "cuda"
+    :param _init_setup_model: build the network at once
+    :raises DatasetError: the dataset cannot be read, or does not fit the environment
+    """
+
+    policy: SequencePolicy
+    action_space: spaces.Box
+    rollout_buffer: None = None
+
+    def __init__(
+        self,
+        policy: str | type[SequencePolicy],
+        env: GymEnv | str | None = None,
+        dataset: Dataset | None = None,
+        learning_rate: float | Schedule = 1e-4,
+        batch_size: int = 256,
+        weight_decay: float = 1e-3,
+        context_length: int = 20,
+        dataset_fraction: float = 1.0,
+        dataset_seed: int = 0,
+        dataset_kwargs: dict[str, Any] | None = None,
+        max_grad_norm: float | None = None,
+        warmup_steps: int = 0,
+        learning_rate_schedule: str = "constant",
+        ema_decay: float = 0.0,
+        precision: str = "auto",
+        policy_kwargs: dict[str, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            support_multi_env=True,
+            seed=seed,
+            supported_action_spaces=(spaces.Box,),
+        )
+        self.dataset = dataset
+        self.batch_size = batch_size
+        self.weight_decay = weight_decay
+        self.context_length = context_length
+        self.dataset_fraction = dataset_fraction
+        self.dataset_seed = dataset_seed
+        self.dataset_kwargs = dataset_kwargs
+        self.max_grad_norm = max_grad_norm
+        self.warmup_steps = warmup_steps
+        self.learning_rate_schedule = learning_rate_schedule
+        self.ema_decay = ema_decay
+        self.precision = precision
+        self.max_timestep = 1000
+        self.score_reference: ScoreReference | None = None
+        self.buffer: TrajectoryBuffer | None = None
+        self._metric_sums: dict[str, th.Tensor] = {}
+        self._metric_steps = 0
+        self._training_seconds = 0.0
+        if _init_setup_model:
+            self._check_arguments()
+            buffer = self._load_buffer() if dataset is not None else None
+            if buffer is not None:
+                self.max_timestep = int(buffer.episode_lengths.max())
+                self.score_reference = buffer.score_reference
+            elif env is None:
+                raise ValueError(f"{type(self).__name__} needs a dataset or an env to know its spaces; both are None.")
+            self._setup_model()
+            if buffer is not None:
+                self.policy.set_statistics(buffer.observations, buffer.returns_to_go)
+
+    def _check_arguments(self) -> None:
+        choices = {"learning_rate_schedule": LEARNING_RATE_SCHEDULES, "precision": PRECISIONS}
+        for name, accepted in choices.items():
+            if getattr(self, name) not in accepted:
+                raise ValueError(f"{name} must be one of {', '.join(accepted)}, got {getattr(self, name)!r}.")
+        for name in ("batch_size", "context_length"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        if not 0.0 <= self.ema_decay < 1.0:
+            raise ValueError(f"ema_decay must lie in [0, 1), got {self.ema_decay}.")
+
+    def set_dataset(self, dataset: Dataset) -> None:
+        """
+        Learn from another dataset from now on; normalisation and spaces stay those of the model.
+
+        :param dataset: as in the constructor
+        :raises DatasetError: it cannot be read, or does not fit the model
+        """
+        self.dataset = dataset
+        self._load_buffer()
+
+    def _load_buffer(self) -> TrajectoryBuffer:
+        """Read the dataset and check it against the spaces, which it defines where there is no environment."""
+        if self.dataset is None:
+            name = type(self).__name__
+            raise ValueError(
+                f"{name} has no dataset to learn from: give one to the constructor, or to a loaded model by "
+                f"{name}.load(path, dataset=...) or model.set_dataset(...)."
+            )
+        buffer = load_dataset(self.dataset, **(self.dataset_kwargs or {}))
+        observation_space = return_to_go_space(buffer.observation_space)
+        if getattr(self, "observation_space", None) is None:
+            self.observation_space, self.action_space, self.n_envs = observation_space, buffer.action_space, 1
+        expected, found = self.observation_space["observation"], buffer.observation_space  # type: ignore[index]
+        if expected.shape != found.shape:
+            raise DatasetError(f"{buffer.source} holds observations of {found}, the environment gives {expected}.")
+        same_bounds = self.action_space.shape == buffer.action_space.shape and (
+            np.allclose(self.action_space.low, buffer.action_space.low)
+            and np.allclose(self.action_space.high, buffer.action_space.high)
+        )
+        if not same_bounds:
+            raise DatasetError(f"{buffer.source} holds actions of {buffer.action_space}, the environment takes {self.action_space}.")
+        self.buffer = buffer.random_fraction(self.dataset_fraction, self.dataset_seed).to(self.device)
+        return self.buffer
+
+    def _setup_model(self) -> None:
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        self.policy = self.policy_class(  # type: ignore[assignment]
+            self.observation_space, self.action_space, self.lr_schedule, **self._policy_arguments()
+        ).to(self.device)
+
+    def _policy_arguments(self) -> dict[str, Any]:
+        return dict(
+            context_length=self.context_length,
+            max_timestep=self.max_timestep,
+            weight_decay=self.weight_decay,
+            ema=self.ema_decay > 0,
+            seed=self.seed,
+            **self.policy_kwargs,
+        )
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        """
+        SB3's wrapping, then a check that return-to-go arrives unharmed.
+
+        :raises ValueError: no return-to-go in the observation, or normalised or stacked observations
+        """
+        env = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        vec_normalize = unwrap_vec_normalize(env)
+        if vec_normalize is not None and vec_normalize.norm_obs:
+            raise ValueError(
+                "VecNormalize(norm_obs=True) would rescale return_to_go and timestep; the policy normalises observations "
+                "itself. Use norm_obs=False, or `normalize: false` in RL-Zoo's YAML."
+            )
+        if is_vecenv_wrapped(env, VecFrameStack):
+            raise ValueError("VecFrameStack would mix up return_to_go and timestep; set context_length instead.")
+        keys = set(getattr(env.observation_space, "spaces", {}))
+        if keys != {"observation", "return_to_go", "timestep"}:
+            raise ValueError(
+                "The environment must be wrapped in sb3_dtfm.envs.ReturnToGoWrapper(env, target_return=...), inside any "
+                f"vectorised environment; its observation space is {env.observation_space}."
+            )
+        return env
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        if isinstance(callback, list):
+            callback = CallbackList(callback)
+        evaluations = find_eval_callbacks(callback) if isinstance(callback, BaseCallback) else []
+        if self.env is None and evaluations:  # SB3's callbacks ask the model for an environment
+            self.n_envs = evaluations[0].eval_env.num_envs
+            self.set_env(evaluations[0].eval_env)
+        children = [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
+        if self.score_reference is not None:
+            children.append(NormalizedScoreCallback(self.score_reference, evaluations))
+        if progress_bar:
+            children.append(GradientStepProgressBar())
+        combined = CallbackList(children)
+        combined.init_callback(self)
+        return combined
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        """SB3's set-up without the environment's first reset, which offline learning does not need."""
+        self.start_time = time.time_ns()
+        if reset_num_timesteps:
+            self.num_timesteps = 0
+        else:
+            total_timesteps += self.num_timesteps
+        self._total_timesteps = total_timesteps
+        self._num_timesteps_at_start = self.num_timesteps
+        self._reset_metrics()
+        if not self._custom_logger:
+            self._logger = configure_logger(self.verbose, self.tensorboard_log, tb_log_name, reset_num_timesteps)
+        return total_timesteps, self._init_callback(callback, progress_bar)
+
+    def learn(
+        self: SelfAlgorithm,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 100,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfAlgorithm:
+        """
+        Train for `total_timesteps` gradient steps; callbacks run once after each.
+
+        :param total_timesteps: gradient steps
+        :param callback: SB3 callback or list of callbacks
+        :param log_interval: gradient steps between two logs, None for none
+        :param tb_log_name: name of the run in TensorBoard, the algorithm's by default
+        :param reset_num_timesteps: count from zero, otherwise go on counting
+        :param progress_bar: show one
+        :return: the model
+        :raises ValueError: no dataset
+        :raises FloatingPointError: the loss is no longer finite
+        """
+        buffer = self.buffer or self._load_buffer()
+        total_timesteps, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
+        )
+        generator = self._training_generator()
+        use_bfloat16 = self.precision == "bfloat16" or (self.precision == "auto" and has_fast_bfloat16(self.device))
+        autocast = th.autocast(self.device.type, dtype=th.bfloat16, enabled=use_bfloat16)
+        callback.on_training_start(locals(), globals())
+        while self.num_timesteps < total_timesteps:
+            step_start = time.perf_counter()
+            self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
+            self._gradient_step(buffer, generator, autocast)
+            self.num_timesteps += 1
+            self._training_seconds += time.perf_counter() - step_start
+            if log_interval and (self.num_timesteps % log_interval == 0 or self.num_timesteps == total_timesteps):
+                self.dump_logs()
+            callback.update_locals(locals())
+            if not callback.on_step():
+                break
+        callback.on_training_end()
+        return self
+
+    def _gradient_step(self, buffer: TrajectoryBuffer, generator: th.Generator, autocast: th.autocast) -> None:
+        self.policy.set_training_mode(True)  # an evaluation in between leaves evaluation mode on
+        self._update_learning_rate(self.policy.optimizer)
+        batch = buffer.sample(self.batch_size, self.context_length, generator)
+        with autocast:
+            loss, parts = self.policy.compute_loss(batch, generator)
+        self.policy.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        grad_norm = th.nn.utils.clip_grad_norm_(self.policy.network.parameters(), self.max_grad_norm or math.inf)
+        self.policy.optimizer.step()
+        self._n_updates += 1
+        if self.ema_decay > 0:
+            # A young average follows more closely, or the random start would stay in it for long.
+            self.policy.update_ema(min(self.ema_decay, (1 + self._n_updates) / (10 + self._n_updates)))
+        self._add_metrics({"loss": loss, "grad_norm": grad_norm, **parts})
+
+    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
+        progress = 1.0 - self._current_progress_remaining
+        factor = min(1.0, (self.num_timesteps + 1) / self.warmup_steps) if self.warmup_steps else 1.0
+        if self.learning_rate_schedule == "linear":
+            factor *= 1.0 - progress
+        elif self.learning_rate_schedule == "cosine":
+            factor *= 0.5 * (1.0 + math.cos(math.pi * progress))
+        self._current_learning_rate = factor * self.lr_schedule(self._current_progress_remaining)
+        for optimizer in optimizers if isinstance(optimizers, list) else [optimizers]:
+            update_learning_rate(optimizer, self._current_learning_rate)
+
+    def _training_generator(self) -> th.Generator:
+        """Randomness of batches and losses: the run's own, and another stream where training is continued."""
+        generator = th.Generator(self.device)
+        if self.seed is None:
+            generator.seed()
+        else:
+            entropy = np.random.SeedSequence([self.seed, self.num_timesteps])
+            generator.manual_seed(int(entropy.generate_state(1, np.uint64)[0]))
+        return generator
+
+    def _reset_metrics(self) -> None:
+        self._metric_sums, self._metric_steps, self._training_seconds = {}, 0, 0.0
+
+    def _add_metrics(self, metrics: dict[str, th.Tensor]) -> None:
+        """Sum on the device: reading a value would wait for it."""
+        for name, value in metrics.items():
+            previous = self._metric_sums.get(name)
+            self._metric_sums[name] = value.detach().clone() if previous is None else previous.add_(value.detach())
+        self._metric_steps += 1
+
+    def dump_logs(self) -> None:
+        """
+        Log the means since the last call.
+
+        :raises FloatingPointError: the loss is no longer finite
+        """
+        if self._metric_steps == 0:
+            return
+        means = {name: float(total) / self._metric_steps for name, total in self._metric_sums.items()}
+        if not math.isfinite(means["loss"]):
+            raise FloatingPointError(
+                f"The loss became {means['loss']} within the {self._metric_steps} gradient steps before step {self.num_timesteps}. "
+                "Try a lower learning_rate, warmup_steps or max_grad_norm."
+            )
+        for name, mean in means.items():
+            self.logger.record(f"train/{name}", mean)
+        self.logger.record("train/action_mse", self._training_action_mse())
+        self.logger.record("train/learning_rate", self._current_learning_rate)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("time/steps_per_second", self._metric_steps / self._training_seconds)
+        self.logger.record("time/time_elapsed", int((time.time_ns() - self.start_time) / 1e9), exclude="tensorboard")
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(step=self.num_timesteps)
+        self._reset_metrics()
+
+    def _training_action_mse(self) -> float:
+        """`train/action_mse` on windows of the training data that belong to the step, so that it disturbs nothing."""
+        assert self.buffer is not None
+        generator = th.Generator(self.device).manual_seed(self.num_timesteps)
+        batch = self.buffer.sample(self.batch_size, self.context_length, generator)
+        return float(self.policy.action_mse(batch, generator))
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "dataset", "buffer", "_metric_sums"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "policy.optimizer"], []
+
+
+class DT(OfflineSequenceAlgorithm):
+    """
+    Decision Transformer (Chen et al., 2021): the action is regressed, under a tanh, from the trunk's hidden state.
+
+    Parameters are those of :class:`OfflineSequenceAlgorithm`.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": DTPolicy}
+
+
+class DTFM(OfflineSequenceAlgorithm):
+    """
+    Decision Transformer with flow matching: the trunk's hidden state conditions a vector field from noise to action.
+
+    `policy_kwargs` also takes `flow_hidden_dim`, `flow_n_layers`, `solver` and `n_solver_steps`.
+
+    :param regression_coef: weight of an auxiliary action regression from the hidden state; 0 leaves it out
+
+    The other parameters are those of :class:`OfflineSequenceAlgorithm`.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": DTFMPolicy}
+
+    def __init__(
+        self,
+        policy: str | type[SequencePolicy],
+        env: GymEnv | str | None = None,
+        dataset: Dataset | None = None,
+        learning_rate: float | Schedule = 1e-4,
+        batch_size: int = 256,
+        weight_decay: float = 1e-3,
+        context_length: int = 20,
+        dataset_fraction: float = 1.0,
+        dataset_seed: int = 0,
+        dataset_kwargs: dict[str, Any] | None = None,
+        max_grad_norm: float | None = None,
+        warmup_steps: int = 0,
+        learning_rate_schedule: str = "constant",
+        ema_decay: float = 0.0,
+        precision: str = "auto",
+        regression_coef: float = 0.0,
+        policy_kwargs: dict[str, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        self.regression_coef = regression_coef
+        super().__init__(
+            policy=policy,
+            env=env,
+            dataset=dataset,
+            learning_rate=learning_rate,
+            batch_size=batch_size,
+            weight_decay=weight_decay,
+            context_length=context_length,
+            dataset_fraction=dataset_fraction,
+            dataset_seed=dataset_seed,
+            dataset_kwargs=dataset_kwargs,
+            max_grad_norm=max_grad_norm,
+            warmup_steps=warmup_steps,
+            learning_rate_schedule=learning_rate_schedule,
+            ema_decay=ema_decay,
+            precision=precision,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=_init_setup_model,
+        )
+
+    def _policy_arguments(self) -> dict[str, Any]:
+        return {**super()._policy_arguments(), "regression_coef": self.regression_coef}
+
+
+def has_fast_bfloat16(device: th.device) -> bool:
+    """Whether matrix products in bfloat16 are faster than in float32 on this device."""
+    if device.type == "cuda":
+        return th.cuda.is_bf16_supported(including_emulation=False)
+    return th.cpu._is_avx512_bf16_supported() or th.cpu._is_amx_tile_supported()

@@ -1,0 +1,82 @@
+"""
+The context window: the last K steps of every environment, as plain arrays.
+
+Pure functions: each returns new arrays and leaves its arguments alone, so a context can serve as SB3's `state`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Context(NamedTuple):
+    """
+    Windows of B environments, newest step last, padded on the left.
+
+    Shapes: observations (B, K, O) as the environment gives them, actions (B, K, A) in [-1, 1], returns_to_go (B, K) in
+    environment reward units, timesteps (B, K) int64, mask (B, K) bool, False on padded steps.
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    returns_to_go: np.ndarray
+    timesteps: np.ndarray
+    mask: np.ndarray
+
+
+def empty_context(n_rows: int, context_length: int, observation_dim: int, action_dim: int) -> Context:
+    """A context in which no row has seen a step yet."""
+    return Context(
+        np.zeros((n_rows, context_length, observation_dim), np.float32),
+        np.zeros((n_rows, context_length, action_dim), np.float32),
+        np.zeros((n_rows, context_length), np.float32),
+        np.zeros((n_rows, context_length), np.int64),
+        np.zeros((n_rows, context_length), bool),
+    )
+
+
+def push(
+    context: Context,
+    observation: np.ndarray,
+    return_to_go: np.ndarray,
+    timestep: np.ndarray,
+    episode_start: np.ndarray | None = None,
+) -> Context:
+    """
+    Add a step to every row; its action stays zero until :func:`with_action`.
+
+    A row starts anew where `episode_start` is True, and also where the step does not follow the row's last one: the
+    environment was reset without anybody saying so.
+
+    :param observation: (B, O)
+    :param return_to_go: (B,)
+    :param timestep: (B,) int64
+    :param episode_start: (B,) bool
+    """
+    restart = timestep != context.timesteps[:, -1] + 1
+    if episode_start is not None:
+        restart |= np.asarray(episode_start, dtype=bool)
+    keep = ~restart[:, None]
+    no_action = np.zeros_like(context.actions[:, 0])
+    return Context(
+        _shift(context.observations, observation),
+        _shift(context.actions, no_action),
+        _shift(context.returns_to_go, return_to_go),
+        _shift(context.timesteps, timestep),
+        np.concatenate((context.mask[:, 1:] & keep, np.ones_like(keep)), axis=1),
+    )
+
+
+def with_action(context: Context, action: np.ndarray) -> Context:
+    """
+    Fill in the newest step's action.
+
+    :param action: (B, A) in [-1, 1]
+    """
+    actions = context.actions.copy()
+    actions[:, -1] = action
+    return context._replace(actions=actions)
+
+
+def _shift(window: np.ndarray, newest: np.ndarray) -> np.ndarray:
+    return np.concatenate((window[:, 1:], newest[:, None]), axis=1)

@@ -1,0 +1,188 @@
+"""Reading Minari datasets into a `TrajectoryBuffer`."""
+
+import itertools
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import minari
+import numpy as np
+from gymnasium import spaces
+from minari.dataset.minari_dataset import parse_dataset_id
+from minari.storage import get_dataset_path
+
+from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, TrajectoryBuffer
+from sb3_dtfm.envs.return_to_go import flatten_observation_space, sort_observation_space
+
+HDF5_FILE_NAME = "main_data.hdf5"
+
+
+def load_minari(dataset: str | minari.MinariDataset) -> TrajectoryBuffer:
+    """
+    Read a Minari dataset: a local one, else one that Minari's own client downloads.
+
+    :param dataset: id (`namespace/name-vN`) or an opened dataset, whose choice of episodes is kept
+    :return: its episodes, with the normalised-score scale of its metadata where it names one
+    :raises DatasetError: neither found nor downloaded, damaged, or not fit for learning (names the file and episode)
+    """
+    if isinstance(dataset, str):
+        dataset = open_minari(dataset)
+    hdf5_file = Path(dataset.storage.data_path) / HDF5_FILE_NAME
+    in_hdf5 = hdf5_file.exists()
+    source = f"Minari dataset {dataset.id} ({hdf5_file if in_hdf5 else hdf5_file.parent})"
+    if len(dataset.episode_indices) == 0:
+        raise DatasetError(f"{source}: holds no episode; at least one is needed.")
+    action_space = check_action_space(dataset.action_space, source)
+    try:
+        observation_space = flatten_observation_space(dataset.observation_space)
+    except ValueError as error:
+        raise DatasetError(f"{source}: {error}") from error
+    episodes = _Hdf5Episodes(dataset, hdf5_file) if in_hdf5 else _StorageEpisodes(dataset)
+    try:
+        return TrajectoryBuffer.from_trajectories(
+            episodes.trajectories(source),
+            action_space,
+            observation_space,
+            lengths=episodes.lengths(),
+            source=source,
+            score_reference=score_reference(dataset),
+        )
+    except (OSError, LookupError, RuntimeError) as error:
+        raise DatasetError(f"{source}: the file is damaged or incomplete: {error}") from error
+
+
+def open_minari(dataset_id: str) -> minari.MinariDataset:
+    """
+    Open a local dataset, or download it first.
+
+    :param dataset_id: `namespace/name-vN`
+    :raises DatasetError: malformed id, damaged local files, or neither found nor downloaded
+    """
+    try:
+        parse_dataset_id(dataset_id)
+    except (ValueError, TypeError) as error:
+        raise DatasetError(f"{dataset_id!r} is no Minari id; expected namespace/name-vN.") from error
+    data_path = get_dataset_path(dataset_id) / "data"
+    if not data_path.exists():
+        _download(dataset_id)
+    try:
+        return minari.load_dataset(dataset_id)
+    except Exception as error:  # Minari checks its files with assert, KeyError and ValueError alike
+        raise DatasetError(f"Minari dataset {dataset_id} ({data_path}) is damaged or incomplete: {error!r}") from error
+
+
+def _download(dataset_id: str) -> None:
+    try:
+        minari.download_dataset(dataset_id)
+    except Exception as error:  # whatever the remote's client raises
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            local = sorted(minari.list_local_datasets())
+        raise DatasetError(
+            f"Minari dataset {dataset_id} is not in {get_dataset_path()} (set by MINARI_DATASETS_PATH), which holds "
+            f"{', '.join(local) if local else 'no dataset'}; and it cannot be downloaded: {error}"
+        ) from error
+
+
+def check_action_space(space: spaces.Space, source: str) -> spaces.Box:
+    """
+    :raises DatasetError: not a bounded Box of shape (A,)
+    """
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1 or not space.is_bounded():
+        raise DatasetError(f"{source}: the action space is {space}; only a bounded Box of shape (A,) can be learnt.")
+    return space
+
+
+def score_reference(dataset: minari.MinariDataset) -> ScoreReference | None:
+    """The scale of normalised scores that a dataset's metadata holds, if it holds one that can be used."""
+    metadata = dataset.storage.metadata
+    minimum, maximum = metadata.get("ref_min_score"), metadata.get("ref_max_score")
+    if minimum is None or maximum is None or not minimum < maximum:
+        return None
+    scale = f"Minari scale of {dataset.id}: 0 = ref_min_score {minimum:.6g}, 1 = ref_max_score {maximum:.6g}"
+    return ScoreReference(float(minimum), float(maximum), scale)
+
+
+class _Hdf5Episodes:
+    """Reads the HDF5 file itself, since Minari's storage decodes all infos with every episode."""
+
+    def __init__(self, dataset: minari.MinariDataset, file: Path) -> None:
+        self.dataset = dataset
+        self.file = file
+
+    def lengths(self) -> list[int]:
+        """Steps of each episode."""
+        with h5py.File(self.file, "r") as file:
+            return [len(file[f"episode_{index}/rewards"]) for index in self.dataset.episode_indices]
+
+    def trajectories(self, source: str) -> Iterator[Trajectory]:
+        with h5py.File(self.file, "r") as file:
+            for index in self.dataset.episode_indices:
+                yield make_trajectory(file[f"episode_{index}"], self.dataset.observation_space, f"episode {index}", source)
+
+
+class _StorageEpisodes:
+    """Reads through Minari's storage: Arrow and Parquet."""
+
+    def __init__(self, dataset: minari.MinariDataset) -> None:
+        self.dataset = dataset
+
+    def lengths(self) -> list[int]:
+        """Steps of each episode."""
+        metadata = self.dataset.storage.get_episode_metadata(self.dataset.episode_indices)
+        return [int(episode["total_steps"]) for episode in metadata]
+
+    def trajectories(self, source: str) -> Iterator[Trajectory]:
+        episodes = self.dataset.storage.get_episodes(self.dataset.episode_indices)
+        for index, episode in zip(self.dataset.episode_indices, episodes, strict=True):
+            yield make_trajectory(episode, self.dataset.observation_space, f"episode {index}", source)
+
+
+def make_trajectory(episode: Mapping[str, Any], observation_space: spaces.Space, name: str, source: str) -> Trajectory:
+    """
+    One episode of a Minari file.
+
+    :param episode: HDF5 group or dict with observations, actions, rewards, terminations, truncations
+    :param observation_space: the dataset's own
+    :param name: what the file calls the episode
+    :param source: the file, for messages
+    :raises DatasetError: its arrays differ in length
+    """
+    n_steps = len(episode["rewards"])
+    columns = flatten_observations(episode["observations"], sort_observation_space(observation_space))
+    counts = sorted({len(column) for column in columns})
+    if len(counts) != 1 or counts[0] - n_steps not in (0, 1):
+        raise DatasetError(
+            f"{source}, {name}: holds {' and '.join(map(str, counts))} observations for {n_steps} rewards; "
+            f"{n_steps + 1} or {n_steps} are accepted."
+        )
+    return Trajectory(
+        observations=np.concatenate([column[:n_steps] for column in columns], axis=1),
+        actions=np.asarray(episode["actions"]),
+        rewards=np.asarray(episode["rewards"], dtype=np.float64),
+        terminated=bool(n_steps and episode["terminations"][-1]),
+        truncated=bool(n_steps and episode["truncations"][-1]),
+        name=name,
+    )
+
+
+def flatten_observations(data: Any, space: spaces.Space) -> list[np.ndarray]:
+    """
+    A whole episode's observations as columns of the vector that the wrapper makes of one observation.
+
+    :param data: HDF5 dataset, array or list of T + 1 (or T) entries; groups, dicts and tuples of these for Dict and Tuple
+    :param space: observation space with sorted keys
+    :return: arrays (T + 1, .) to be joined along the second axis
+    """
+    if isinstance(space, spaces.Dict):
+        return [column for key, part in space.spaces.items() for column in flatten_observations(data[key], part)]
+    if isinstance(space, spaces.Tuple):
+        parts: Any = [data[f"_index_{i}"] for i in range(len(space))] if isinstance(data, h5py.Group) else data
+        columns = [flatten_observations(entry, part) for entry, part in zip(parts, space.spaces, strict=True)]
+        return list(itertools.chain.from_iterable(columns))
+    values = np.asarray(data)
+    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
+        return [np.stack([np.asarray(spaces.flatten(space, value)) for value in values])]
+    return [values.reshape(len(values), -1)]

@@ -1,0 +1,135 @@
+"""The causal Transformer over return-to-go, observation and action tokens that `DT` and `DTFM` share."""
+
+import torch as th
+from torch import nn
+from torch.nn import functional as F
+
+
+class TransformerBlock(nn.Module):
+    """Pre-norm block: causal self-attention, then a four times wider GELU MLP, each on a residual path."""
+
+    def __init__(self, embed_dim: int, n_heads: int, dropout: float) -> None:
+        super().__init__()
+        self.n_heads = n_heads
+        self.dropout = dropout
+        self.attention_norm = nn.LayerNorm(embed_dim)
+        self.attention_in = nn.Linear(embed_dim, 3 * embed_dim)
+        self.attention_out = nn.Linear(embed_dim, embed_dim)
+        self.mlp_norm = nn.LayerNorm(embed_dim)
+        self.mlp = nn.Sequential(nn.Linear(embed_dim, 4 * embed_dim), nn.GELU(), nn.Linear(4 * embed_dim, embed_dim))
+        self.residual_dropout = nn.Dropout(dropout)
+
+    def forward(self, tokens: th.Tensor, attention_mask: th.Tensor) -> th.Tensor:
+        """
+        :param tokens: (B, L, D)
+        :param attention_mask: (B, 1, L, L) bool, True where the query (third axis) may see the key (fourth)
+        :return: (B, L, D)
+        """
+        tokens = tokens + self.residual_dropout(self._attend(self.attention_norm(tokens), attention_mask))
+        return tokens + self.residual_dropout(self.mlp(self.mlp_norm(tokens)))
+
+    def _attend(self, tokens: th.Tensor, attention_mask: th.Tensor) -> th.Tensor:
+        batch, length, width = tokens.shape
+        heads = self.attention_in(tokens).view(batch, length, 3, self.n_heads, width // self.n_heads)
+        query, key, value = heads.permute(2, 0, 3, 1, 4)  # (B, heads, L, D / heads) each
+        attended = F.scaled_dot_product_attention(
+            query, key, value, attn_mask=attention_mask, dropout_p=self.dropout if self.training else 0.0
+        )
+        return self.attention_out(attended.transpose(1, 2).reshape(batch, length, width))
+
+
+class SequenceTrunk(nn.Module):
+    """
+    Decision Transformer trunk (Chen et al., 2021): a window of steps in, one hidden state per step out.
+
+    Each step gives three tokens, return-to-go, observation and action, each by its own linear map plus a learned
+    embedding of the absolute time step. The hidden state of step t is read at its observation token: it has seen
+    return-to-go and observation of t and everything before them, and not the action of t.
+
+    :param observation_dim: O
+    :param action_dim: A
+    :param max_timestep: number of embedded time steps; later ones share the last embedding
+    :param embed_dim: width D
+    :param n_layers: number of blocks
+    :param n_heads: attention heads, a divisor of `embed_dim`
+    :param dropout: probability on embeddings, attention weights and residual branches
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        action_dim: int,
+        max_timestep: int,
+        embed_dim: int = 256,
+        n_layers: int = 10,
+        n_heads: int = 2,
+        dropout: float = 0.1,
+    ) -> None:
+        super().__init__()
+        if embed_dim % n_heads:
+            raise ValueError(f"embed_dim must be a multiple of n_heads, got embed_dim={embed_dim} and n_heads={n_heads}.")
+        self.embed_dim = embed_dim
+        self.n_layers = n_layers
+        self.embed_return_to_go = nn.Linear(1, embed_dim)
+        self.embed_observation = nn.Linear(observation_dim, embed_dim)
+        self.embed_action = nn.Linear(action_dim, embed_dim)
+        self.embed_timestep = nn.Embedding(max_timestep, embed_dim)
+        self.embedding_dropout = nn.Dropout(dropout)
+        self.blocks = nn.ModuleList(TransformerBlock(embed_dim, n_heads, dropout) for _ in range(n_layers))
+        self.final_norm = nn.LayerNorm(embed_dim)
+        self.apply(self._initialize)
+
+    def _initialize(self, module: nn.Module) -> None:
+        """GPT-2's initialisation: normal weights of 0.02, and smaller where residual branches add up."""
+        if isinstance(module, (nn.Linear, nn.Embedding)):
+            nn.init.normal_(module.weight, std=0.02)
+        if isinstance(module, nn.Linear):
+            nn.init.zeros_(module.bias)
+        if isinstance(module, TransformerBlock):
+            for branch_end in (module.attention_out, module.mlp[-1]):
+                nn.init.normal_(branch_end.weight, std=0.02 / (2 * self.n_layers) ** 0.5)
+
+    def forward(
+        self,
+        observations: th.Tensor,
+        actions: th.Tensor,
+        returns_to_go: th.Tensor,
+        timesteps: th.Tensor,
+        mask: th.Tensor,
+    ) -> th.Tensor:
+        """
+        :param observations: (B, K, O), normalised
+        :param actions: (B, K, A) in [-1, 1]; the last step's action is not read
+        :param returns_to_go: (B, K), scaled
+        :param timesteps: (B, K) int64
+        :param mask: (B, K) bool, False on padded steps
+        :return: (B, K, D) hidden states
+        """
+        batch, context_length = mask.shape
+        time = self.embed_timestep(timesteps.clamp(max=self.embed_timestep.num_embeddings - 1))
+        tokens = th.stack(
+            (
+                self.embed_return_to_go(returns_to_go.unsqueeze(-1)) + time,
+                self.embed_observation(observations) + time,
+                self.embed_action(actions) + time,
+            ),
+            dim=2,
+        ).view(batch, 3 * context_length, self.embed_dim)
+        tokens = self.embedding_dropout(tokens[:, :-1])  # nothing attends to the last action
+        attention_mask = causal_mask(mask.repeat_interleave(3, dim=1)[:, :-1])
+        for block in self.blocks:
+            tokens = block(tokens, attention_mask)
+        return self.final_norm(tokens[:, 1::3])
+
+
+def causal_mask(valid: th.Tensor) -> th.Tensor:
+    """
+    Which tokens each token may attend to: itself, and the valid ones before it.
+
+    :param valid: (B, L) bool
+    :return: (B, 1, L, L) bool
+    """
+    length = valid.shape[1]
+    causal = th.ones(length, length, dtype=th.bool, device=valid.device).tril()
+    itself = th.eye(length, dtype=th.bool, device=valid.device)  # a padded token sees itself: no row is empty, none is NaN
+    return ((causal & valid.unsqueeze(1)) | itself).unsqueeze(1)

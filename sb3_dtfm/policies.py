@@ -1,0 +1,426 @@
+"""The policies: normalisation, context and acting in one place; `DTPolicy` and `DTFMPolicy` differ in their head only."""
+
+import copy
+from abc import abstractmethod
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import nn
+
+from sb3_dtfm.context import Context, empty_context, push, with_action
+from sb3_dtfm.networks.flow import check_solver
+from sb3_dtfm.networks.heads import FlowHead, RegressionHead
+from sb3_dtfm.networks.trunk import SequenceTrunk
+
+# Observations are clipped at this many standard deviations, as SB3's VecNormalize does.
+OBSERVATION_CLIP = 10.0
+# Steps after which deterministic acting repeats its noise; longer than a usual episode.
+NOISE_PERIOD = 1024
+
+
+class SequenceTensors(NamedTuple):
+    """
+    Windows on the policy's device: what :class:`~sb3_dtfm.data.SequenceBatch` and
+    :class:`~sb3_dtfm.context.Context` have in common.
+
+    Shapes: observations (B, K, O) as the environment gives them, actions (B, K, A) in [-1, 1], returns_to_go (B, K) in
+    environment reward units, timesteps (B, K) int64, mask (B, K) bool.
+    """
+
+    observations: th.Tensor
+    actions: th.Tensor
+    returns_to_go: th.Tensor
+    timesteps: th.Tensor
+    mask: th.Tensor
+
+
+class SequenceNetwork(nn.Module):
+    """Everything that is trained: the trunk, the action head and, if asked for, the auxiliary regression head."""
+
+    def __init__(self, trunk: SequenceTrunk, head: nn.Module, auxiliary_head: RegressionHead | None = None) -> None:
+        super().__init__()
+        self.trunk = trunk
+        self.head = head
+        self.auxiliary_head = auxiliary_head
+
+
+class SequencePolicy(BasePolicy):
+    """
+    A policy over the last `context_length` steps.
+
+    :param observation_space: Dict of `observation` (O,), `return_to_go` (1,) and `timestep` (1,)
+    :param action_space: bounded Box (A,)
+    :param lr_schedule: learning rate over the progress remaining, from 1 to 0
+    :param context_length: K, steps the policy sees
+    :param max_timestep: time steps with an embedding of their own
+    :param embed_dim: width of the trunk
+    :param n_layers: number of Transformer blocks
+    :param n_heads: attention heads
+    :param dropout: dropout probability of the trunk
+    :param weight_decay: AdamW's, on weight matrices only
+    :param ema: keep an exponential moving average of the weights and act with it
+    :param seed: seed of the noise that acting starts from
+    """
+
+    observation_space: spaces.Dict
+    action_space: spaces.Box
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        context_length: int = 20,
+        max_timestep: int = 1000,
+        embed_dim: int = 256,
+        n_layers: int = 10,
+        n_heads: int = 2,
+        dropout: float = 0.1,
+        weight_decay: float = 1e-3,
+        ema: bool = False,
+        seed: int | None = None,
+    ) -> None:
+        super().__init__(observation_space, action_space, normalize_images=False, optimizer_class=th.optim.AdamW)
+        self.context_length = context_length
+        self.max_timestep = max_timestep
+        self.embed_dim = embed_dim
+        self.n_layers = n_layers
+        self.n_heads = n_heads
+        self.dropout = dropout
+        self.weight_decay = weight_decay
+        self.ema = ema
+        self.seed = seed
+        self.observation_dim = int(observation_space["observation"].shape[0])  # type: ignore[index]
+        self.action_dim = int(action_space.shape[0])
+        self.register_buffer("observation_mean", th.zeros(self.observation_dim))
+        self.register_buffer("observation_std", th.ones(self.observation_dim))
+        self.register_buffer("return_scale", th.ones(()))
+        self.register_buffer("action_low", th.as_tensor(action_space.low), persistent=False)
+        self.register_buffer("action_high", th.as_tensor(action_space.high), persistent=False)
+        self._context: Context | None = None
+
+        trunk = SequenceTrunk(
+            self.observation_dim, self.action_dim, max_timestep, embed_dim, n_layers, n_heads, dropout
+        )
+        self.network = SequenceNetwork(trunk, self._make_head(), self._make_auxiliary_head())
+        self.ema_network = copy.deepcopy(self.network).requires_grad_(False) if ema else None
+        self.optimizer = self._make_optimizer(lr_schedule(1.0))
+
+    @property
+    def acting_network(self) -> SequenceNetwork:
+        """The weights that choose actions: the moving average if there is one."""
+        return self.network if self.ema_network is None else self.ema_network
+
+    @abstractmethod
+    def _make_head(self) -> nn.Module:
+        """The action head."""
+
+    def _make_auxiliary_head(self) -> RegressionHead | None:
+        """A regression head beside the action head, if the policy has one."""
+        return None
+
+    @abstractmethod
+    def compute_loss(self, batch: NamedTuple, generator: th.Generator) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        """
+        :param batch: a :class:`~sb3_dtfm.data.SequenceBatch`, actions in the environment's range
+        :param generator: source of the loss's own randomness
+        :return: the loss to minimise, and its parts by their logged names
+        """
+
+    @abstractmethod
+    def _generate(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        """
+        Actions from hidden states.
+
+        :param hidden: (B, D)
+        :param noise: (B, A), standard normal
+        :return: (B, A), to be clipped to [-1, 1]
+        """
+
+    def _make_optimizer(self, learning_rate: float) -> th.optim.Optimizer:
+        """AdamW whose weight decay spares biases, norms and embeddings."""
+        matrices = [m.weight for m in self.network.modules() if isinstance(m, nn.Linear)]
+        decayed = {id(weight) for weight in matrices}
+        others = [parameter for parameter in self.network.parameters() if id(parameter) not in decayed]
+        groups = [{"params": matrices, "weight_decay": self.weight_decay}, {"params": others, "weight_decay": 0.0}]
+        return self.optimizer_class(groups, lr=learning_rate, fused=True)  # type: ignore[call-arg]
+
+    def set_statistics(self, observations: th.Tensor, returns_to_go: th.Tensor) -> None:
+        """
+        Take the input normalisation from training data.
+
+        :param observations: (N, O)
+        :param returns_to_go: (N,), environment reward units
+        """
+        std, mean = th.std_mean(observations, dim=0, correction=0)
+        std = th.where(std > 1e-6, std, th.ones_like(std))  # a constant dimension becomes zero
+        scale = returns_to_go.abs().max()
+        self.observation_mean.copy_(mean)
+        self.observation_std.copy_(std)
+        self.return_scale.copy_(scale if scale > 0 else th.ones_like(scale))
+
+    def scale_action(self, action: Any) -> Any:
+        """From the environment's range to [-1, 1]; accepts tensors (..., A) and, as SB3 does, arrays."""
+        if isinstance(action, np.ndarray):
+            return super().scale_action(action)
+        return 2.0 * (action - self.action_low) / (self.action_high - self.action_low) - 1.0
+
+    def hidden_states(self, network: SequenceNetwork, windows: SequenceTensors) -> th.Tensor:
+        """
+        Run the trunk on windows in environment units.
+
+        :return: (B, K, D)
+        """
+        normalized = (windows.observations - self.observation_mean) / self.observation_std
+        return network.trunk(
+            normalized.clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP),
+            windows.actions,
+            windows.returns_to_go / self.return_scale,
+            windows.timesteps,
+            windows.mask,
+        )
+
+    def scaled_windows(self, batch: Any) -> SequenceTensors:
+        """The windows of a :class:`~sb3_dtfm.data.SequenceBatch`, with actions in [-1, 1]."""
+        return SequenceTensors(*batch)._replace(actions=self.scale_action(batch.actions))
+
+    def action_mse(self, batch: Any, generator: th.Generator) -> th.Tensor:
+        """
+        Mean squared error, in units of [-1, 1], of the acting policy's actions at each window's last step.
+
+        The same measure for every head: what `predict` would do on recorded windows against what was recorded.
+
+        :param batch: a :class:`~sb3_dtfm.data.SequenceBatch`
+        :param generator: source of the noise that actions start from
+        """
+        self.set_training_mode(False)
+        with th.no_grad():
+            windows = self.scaled_windows(batch)
+            hidden = self.hidden_states(self.acting_network, windows)[:, -1]
+            actions = self._generate(hidden, _standard_normal(len(hidden), self.action_dim, generator)).clamp(-1.0, 1.0)
+            return (actions - windows.actions[:, -1]).square().mean()
+
+    def update_ema(self, decay: float) -> None:
+        """
+        Move the acting weights towards the trained ones.
+
+        :param decay: share of the old average that stays
+        """
+        averaged, trained = list(self.acting_network.parameters()), list(self.network.parameters())
+        with th.no_grad():
+            th._foreach_lerp_(averaged, trained, 1.0 - decay)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        Choose actions with the whole context.
+
+        With `state` given this is a pure function. Without it the policy keeps the context itself, so that
+        `action, _ = model.predict(obs)` in a loop is enough: a row starts anew whenever its time step is not the last
+        one plus one.
+
+        :param observation: Dict of `observation` (O,), `return_to_go` (1,), `timestep` (1,), or with a leading axis B
+        :param state: what the last call returned
+        :param episode_start: (B,) bool, True where an environment was just reset
+        :param deterministic: repeat exactly for the same model, state and inputs; otherwise draw fresh noise
+        :return: actions (A,) or (B, A) in the environment's range, and the next state
+        :raises ValueError: not the observation of a `ReturnToGoWrapper`, or a state of another number of environments
+        """
+        arrays, vectorized = self._check_observation(observation)
+        n_rows = len(arrays[0])
+        if state is not None:
+            context = Context(*state)
+            if len(context.mask) != n_rows:
+                raise ValueError(f"state belongs to {len(context.mask)} environments, the observation to {n_rows}.")
+        elif self._context is not None and len(self._context.mask) == n_rows:
+            context = self._context
+        else:
+            context = empty_context(n_rows, self.context_length, self.observation_dim, self.action_dim)
+        context = push(context, *arrays, episode_start=episode_start)
+        scaled_action = self._act(context, deterministic)
+        context = with_action(context, scaled_action)
+        if state is None:
+            self._context = context
+        action = np.clip(self.unscale_action(scaled_action), self.action_space.low, self.action_space.high)
+        return action if vectorized else action.squeeze(axis=0), tuple(context)
+
+    def _check_observation(self, observation: Any) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], bool]:
+        """Observation (B, O), return-to-go (B,) and time step (B,) as arrays, and whether B was there."""
+        if not isinstance(observation, dict) or not set(self.observation_space.spaces) <= set(observation):
+            found = f"the keys {sorted(observation)}" if isinstance(observation, dict) else type(observation).__name__
+            raise ValueError(
+                f"The observation must be a dict with the keys {sorted(self.observation_space.spaces)}, as "
+                f"sb3_dtfm.envs.ReturnToGoWrapper gives it; got {found}."
+            )
+        values = np.asarray(observation["observation"], dtype=np.float32)
+        if values.ndim not in (1, 2) or values.shape[-1] != self.observation_dim:
+            raise ValueError(
+                f"observation['observation'] has shape {values.shape}; "
+                f"({self.observation_dim},) or (n_envs, {self.observation_dim}) is expected."
+            )
+        vectorized = values.ndim == 2
+        values = values.reshape(-1, self.observation_dim)
+        return_to_go = np.asarray(observation["return_to_go"], dtype=np.float32).reshape(len(values))
+        timestep = np.asarray(observation["timestep"], dtype=np.int64).reshape(len(values))
+        return (values, return_to_go, timestep), vectorized
+
+    def _act(self, context: Context, deterministic: bool) -> np.ndarray:
+        """The newest step's actions, (B, A) in [-1, 1]."""
+        self.set_training_mode(False)
+        with th.inference_mode():
+            windows = SequenceTensors(*(th.from_numpy(array).to(self.device) for array in context))
+            hidden = self.hidden_states(self.acting_network, windows)[:, -1]
+            noise = self._acting_noise(windows.timesteps[:, -1], deterministic)
+            return self._generate(hidden, noise).clamp(-1.0, 1.0).cpu().numpy()
+
+    def _acting_noise(self, timestep: th.Tensor, deterministic: bool) -> th.Tensor:
+        """
+        What acting starts from; a policy that needs no noise leaves this as it is.
+
+        :param timestep: (B,)
+        """
+        return th.zeros(len(timestep), self.action_dim, device=self.device)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        """Actions (B, A) in the environment's range for single steps without a past."""
+        assert isinstance(observation, dict)
+        arrays, _ = self._check_observation({key: value.cpu().numpy() for key, value in observation.items()})
+        context = empty_context(len(arrays[0]), self.context_length, self.observation_dim, self.action_dim)
+        action = self.unscale_action(self._act(push(context, *arrays), deterministic))
+        return th.as_tensor(action, device=self.device)
+
+    def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self._predict(observation, deterministic)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        names = ("context_length", "max_timestep", "embed_dim", "n_layers", "n_heads", "dropout", "weight_decay", "ema", "seed")
+        return dict(
+            observation_space=self.observation_space,
+            action_space=self.action_space,
+            lr_schedule=self._dummy_schedule,  # not needed to act
+            **{name: getattr(self, name) for name in names},
+        )
+
+
+class DTPolicy(SequencePolicy):
+    """Decision Transformer: the action is regressed from the hidden state, bounded by tanh."""
+
+    def _make_head(self) -> RegressionHead:
+        return RegressionHead(self.embed_dim, self.action_dim)
+
+    def compute_loss(self, batch: Any, generator: th.Generator) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        windows = self.scaled_windows(batch)
+        loss = self.network.head.loss(self.hidden_states(self.network, windows), windows.actions, windows.mask)
+        return loss, {"regression_loss": loss}
+
+    def _generate(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        return self.acting_network.head(hidden)
+
+
+class DTFMPolicy(SequencePolicy):
+    """
+    Decision Transformer with flow matching: the hidden state conditions a vector field from noise to action.
+
+    `deterministic=True` starts from noise that belongs to the time step: drawn once from `seed`, saved with the model.
+    Zero noise would be one point of the distribution, and following the same mode for ever gets an arm stuck.
+
+    :param flow_hidden_dim: width of the vector field's hidden layers
+    :param flow_n_layers: number of its hidden layers
+    :param solver: ODE solver for acting: euler, midpoint, heun or rk4
+    :param n_solver_steps: steps of the solver
+    :param regression_coef: weight of the auxiliary action regression; 0 leaves it out
+
+    The other parameters are those of :class:`SequencePolicy`.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        flow_hidden_dim: int = 512,
+        flow_n_layers: int = 3,
+        solver: str = "euler",
+        n_solver_steps: int = 50,
+        regression_coef: float = 0.0,
+        **kwargs: Any,
+    ) -> None:
+        self._flow_parameters = dict(
+            flow_hidden_dim=flow_hidden_dim,
+            flow_n_layers=flow_n_layers,
+            solver=solver,
+            n_solver_steps=n_solver_steps,
+            regression_coef=regression_coef,
+        )
+        self.regression_coef = regression_coef
+        super().__init__(*args, **kwargs)
+        noise_generator = th.Generator().manual_seed(0 if self.seed is None else self.seed)
+        self.register_buffer("noise_table", _standard_normal(NOISE_PERIOD, self.action_dim, noise_generator))
+        self._acting_generator: th.Generator | None = None
+
+    def _make_head(self) -> FlowHead:
+        parameters: dict[str, Any] = self._flow_parameters
+        return FlowHead(
+            self.embed_dim,
+            self.action_dim,
+            parameters["flow_hidden_dim"],
+            parameters["flow_n_layers"],
+            parameters["solver"],
+            parameters["n_solver_steps"],
+        )
+
+    def _make_auxiliary_head(self) -> RegressionHead | None:
+        return RegressionHead(self.embed_dim, self.action_dim) if self.regression_coef > 0 else None
+
+    def compute_loss(self, batch: Any, generator: th.Generator) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        windows = self.scaled_windows(batch)
+        hidden = self.hidden_states(self.network, windows)
+        noise = th.randn(windows.actions.shape, generator=generator, device=hidden.device)
+        tau = th.rand(windows.mask.shape, generator=generator, device=hidden.device)
+        flow_loss = self.network.head.loss(hidden, windows.actions, windows.mask, noise, tau)
+        if self.network.auxiliary_head is None:
+            return flow_loss, {"flow_loss": flow_loss}
+        regression_loss = self.network.auxiliary_head.loss(hidden, windows.actions, windows.mask)
+        loss = flow_loss + self.regression_coef * regression_loss
+        return loss, {"flow_loss": flow_loss, "regression_loss": regression_loss}
+
+    def _generate(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        return self.acting_network.head(hidden, noise)
+
+    def set_solver(self, solver: str, n_solver_steps: int) -> None:
+        """
+        Choose another ODE solver for acting; the trained weights do not depend on it.
+
+        :param solver: euler, midpoint, heun or rk4
+        :param n_solver_steps: steps of the solver
+        :raises ValueError: unknown solver, or fewer than one step
+        """
+        check_solver(solver, n_solver_steps)
+        self._flow_parameters.update(solver=solver, n_solver_steps=n_solver_steps)
+        for head in {self.network.head, self.acting_network.head}:
+            head.solver, head.n_solver_steps = solver, n_solver_steps
+
+    def _acting_noise(self, timestep: th.Tensor, deterministic: bool) -> th.Tensor:
+        if deterministic:
+            return self.noise_table[timestep % NOISE_PERIOD]
+        if self._acting_generator is None:
+            self._acting_generator = th.Generator(self.device)
+            if self.seed is None:
+                self._acting_generator.seed()
+            else:
+                self._acting_generator.manual_seed(self.seed)
+        return _standard_normal(len(timestep), self.action_dim, self._acting_generator)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), **self._flow_parameters}
+
+
+def _standard_normal(n_rows: int, dim: int, generator: th.Generator) -> th.Tensor:
+    return th.randn(n_rows, dim, generator=generator, device=generator.device)

@@ -1,0 +1,1 @@
+"""Command line and RL-Zoo: `dt` and `dtfm` beside the Zoo's own algorithms."""

@@ -1,0 +1,92 @@
+"""What `sb3-dtfm train` and `enjoy` add to RL-Zoo's own arguments, written in terms of those."""
+
+import argparse
+from collections.abc import Sequence
+
+from sb3_dtfm.zoo.registration import OFFLINE_ALGORITHMS, PACKAGED_CONFIGS, packaged_config
+
+TRAIN_EXAMPLES = """\
+  sb3-dtfm train --algo dtfm --env HalfCheetah-v5
+  sb3-dtfm train --algo dt --env robosuite/Lift-v0 --conf-file small --dataset lift.hdf5 --dataset-fraction 0.5
+"""
+
+
+class UsageError(ValueError):
+    """Arguments that do not go together; the message says which would."""
+
+
+def train_parser() -> argparse.ArgumentParser:
+    """Arguments of `train` that RL-Zoo does not have, or that get a default or a meaning here."""
+    parser = argparse.ArgumentParser(
+        prog="sb3-dtfm train",
+        add_help=False,
+        usage="sb3-dtfm train --algo dtfm --env ENV [options] [RL-Zoo options]",
+        description="Train with RL-Zoo. One timestep of dt and dtfm is one gradient step on recorded episodes.",
+        epilog=f"examples:\n{TRAIN_EXAMPLES}\nRL-Zoo's own options follow.\n",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--dataset", help="dt, dtfm: Minari id or robomimic hdf5 file to learn from")
+    parser.add_argument("--dataset-fraction", type=float, help="dt, dtfm: randomly drawn share of the episodes, in (0, 1]")
+    parser.add_argument("--target-return", type=float, help="dt, dtfm: return to ask for when acting, in reward units")
+    parser.add_argument(
+        "-conf",
+        "--conf-file",
+        help="dt, dtfm: the packaged settings of the paper if not given, 'small' for those of a 2-core machine; "
+        "else a YAML file or a Python package, as in RL-Zoo",
+    )
+    shared = parser.add_argument_group("read on the way to RL-Zoo").add_argument
+    shared("--algo", default="ppo", help=argparse.SUPPRESS)
+    shared("-params", "--hyperparams", nargs="+", action="extend", default=[], help=argparse.SUPPRESS)
+    return parser
+
+
+def train_arguments(argv: Sequence[str]) -> list[str]:
+    """
+    Arguments for RL-Zoo's `train`.
+
+    The shorthands become hyperparameters. They are merged with the user's own, since RL-Zoo keeps only the last `-params`.
+
+    :param argv: the user's arguments
+    :raises UsageError: a shorthand for an algorithm that knows no dataset
+    """
+    options, rest = train_parser().parse_known_args(argv)
+    shorthands = _shorthands(options)
+    if options.algo not in OFFLINE_ALGORITHMS and shorthands:
+        names = ", ".join(option for option, _ in shorthands)
+        raise UsageError(f"{names}: for --algo {' and '.join(OFFLINE_ALGORITHMS)} only, not for {options.algo}.")
+    conf_file = options.conf_file
+    if options.algo in OFFLINE_ALGORITHMS and conf_file in PACKAGED_CONFIGS:
+        conf_file = str(packaged_config(options.algo, conf_file))
+    arguments = ["--algo", options.algo, *rest]
+    if conf_file is not None:
+        arguments += ["--conf-file", conf_file]
+    hyperparams = [*options.hyperparams, *(value for _, value in shorthands)]
+    if hyperparams:
+        arguments += ["--hyperparams", *hyperparams]
+    return arguments
+
+
+def _shorthands(options: argparse.Namespace) -> list[tuple[str, str]]:
+    """Pairs of an option that was given and its `key:value`, whose value RL-Zoo evaluates as Python."""
+    wrapper = [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": options.target_return}}]
+    candidates = [
+        ("--dataset", "dataset", options.dataset, options.dataset),
+        ("--dataset-fraction", "dataset_fraction", options.dataset_fraction, options.dataset_fraction),
+        ("--target-return", "env_wrapper", options.target_return, wrapper),
+    ]
+    return [(option, f"{key}:{value!r}") for option, key, given, value in candidates if given is not None]
+
+
+def enjoy_arguments(argv: Sequence[str]) -> list[str]:
+    """
+    Arguments for RL-Zoo's `enjoy`: dt and dtfm are looked for where `train` puts them, not among the Zoo's own trained agents.
+
+    :param argv: the user's arguments
+    """
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--algo")
+    parser.add_argument("-f", "--folder")
+    options, _ = parser.parse_known_args(argv)
+    if options.algo in OFFLINE_ALGORITHMS and options.folder is None:
+        return [*argv, "--folder", "logs"]
+    return list(argv)

@@ -1,0 +1,145 @@
+"""The `sb3-dtfm` command."""
+
+import argparse
+import importlib.util
+import os
+import sys
+from collections.abc import Callable, Sequence
+from types import CodeType
+
+from gymnasium.error import Error as GymnasiumError
+
+EXPECTED_ERRORS = (ValueError, AssertionError, OSError, ImportError, GymnasiumError)
+
+
+def train(argv: Sequence[str]) -> None:
+    """RL-Zoo's `train`, with dt and dtfm."""
+    from rl_zoo3.train import train as zoo_train
+
+    from sb3_dtfm.zoo.arguments import train_arguments, train_parser
+    from sb3_dtfm.zoo.registration import register
+
+    register()
+    if {"-h", "--help"} & set(argv):
+        train_parser().print_help()
+        _run_with_arguments(zoo_train, "train", ["--help"])
+    _run_with_arguments(zoo_train, "train", train_arguments(argv))
+
+
+def enjoy(argv: Sequence[str]) -> None:
+    """RL-Zoo's `enjoy`, with dt and dtfm."""
+    from rl_zoo3.enjoy import enjoy as zoo_enjoy
+
+    from sb3_dtfm.zoo.arguments import enjoy_arguments
+    from sb3_dtfm.zoo.registration import register
+
+    register()
+    _run_with_arguments(zoo_enjoy, "enjoy", enjoy_arguments(argv))
+
+
+def record(argv: Sequence[str]) -> None:
+    """Make a dataset from a trained agent or a scripted demonstrator."""
+    from sb3_dtfm.zoo.recording import record as record_dataset
+
+    record_dataset(argv)
+
+
+def demo(argv: Sequence[str]) -> None:
+    """Record, train and evaluate on robosuite's Lift, start to end."""
+    from sb3_dtfm.zoo.demo import main as run_demo
+
+    run_demo(argv)
+
+
+def plot(argv: Sequence[str]) -> None:
+    """Draw the learning curve of a run of `train`."""
+    from sb3_dtfm.zoo.plots import main as plot_run
+
+    plot_run(argv)
+
+
+COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {
+    "train": train,
+    "enjoy": enjoy,
+    "record": record,
+    "demo": demo,
+    "plot": plot,
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run one command.
+
+    A user's mistake ends in one line on standard error; an error in the midst of training keeps its traceback.
+
+    :param argv: arguments after the program's name; those of the process by default
+    :return: exit code: 0, or 2 after a user's mistake
+    """
+    options = _parser().parse_args(argv)
+    if options.command in ("train", "enjoy", "demo") and importlib.util.find_spec("rl_zoo3") is None:
+        return _fail(options.command, 'needs RL-Zoo: pip install "sb3-dtfm[zoo]"')
+    try:
+        COMMANDS[options.command](options.arguments)
+    except EXPECTED_ERRORS as error:
+        if options.debug or _raised_while_training(error):
+            raise
+        return _fail(options.command, _describe(error))
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    lines = [f"  {name:8}{command.__doc__}" for name, command in COMMANDS.items()]
+    parser = argparse.ArgumentParser(
+        prog="sb3-dtfm",
+        description="Offline reinforcement learning for Stable-Baselines3.",
+        epilog="\n".join(["commands:", *lines, "", "`sb3-dtfm COMMAND --help` lists a command's arguments."]),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--debug", action="store_true", help="show the traceback of any error")
+    parser.add_argument("command", choices=COMMANDS, metavar="COMMAND", help=", ".join(COMMANDS))
+    parser.add_argument("arguments", nargs=argparse.REMAINDER, metavar="...", help="the command's own arguments")
+    return parser
+
+
+def _run_with_arguments(function: Callable[[], None], command: str, arguments: Sequence[str]) -> None:
+    """RL-Zoo's functions read `sys.argv`."""
+    saved = sys.argv
+    sys.argv = [f"sb3-dtfm {command}", *arguments]
+    try:
+        function()
+    finally:
+        sys.argv = saved
+
+
+def _fail(command: str, message: str) -> int:
+    print(f"sb3-dtfm {command}: error: {message}", file=sys.stderr)
+    return 2
+
+
+def _describe(error: BaseException) -> str:
+    message = " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, OSError) and error.strerror and error.filename:
+        message = f"{error.filename}: {os.strerror(error.errno) if error.errno else error.strerror}"
+    return message
+
+
+def _raised_while_training(error: BaseException) -> bool:
+    if "rl_zoo3.exp_manager" not in sys.modules:
+        return False
+    from rl_zoo3.exp_manager import ExperimentManager
+
+    return _raised_inside(error, ExperimentManager.learn.__code__)
+
+
+def _raised_inside(error: BaseException, code: CodeType) -> bool:
+    traceback = error.__traceback__
+    while traceback is not None:
+        if traceback.tb_frame.f_code is code:
+            return True
+        traceback = traceback.tb_next
+    return False
+
+
+if __name__ == "__main__":
+    sys.exit(main())

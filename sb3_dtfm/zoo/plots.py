@@ -1,0 +1,134 @@
+"""Learning curves of a run of `sb3-dtfm train`: evaluation and training loss over gradient steps."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.stats import binomtest
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+COLORS = {"evaluation": "#1b6ca8", "loss": "#c0562b"}
+
+
+class Evaluations(NamedTuple):
+    """
+    What RL-Zoo's evaluations during training found, at each of E gradient steps with n episodes.
+
+    Shapes: steps (E,), returns (E, n) in environment reward units, successes (E, n) bool or None where a task has no success.
+    """
+
+    steps: np.ndarray
+    returns: np.ndarray
+    successes: np.ndarray | None
+
+
+def wilson_interval(n_successes: int, n_episodes: int) -> tuple[float, float]:
+    """Limits of the 95 % Wilson score interval of a success rate, in [0, 1]."""
+    interval = binomtest(n_successes, n_episodes).proportion_ci(confidence_level=0.95, method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def load_evaluations(run_folder: Path | str) -> Evaluations:
+    """
+    Read `evaluations.npz` of a run folder.
+
+    :raises FileNotFoundError: the run was not evaluated while it trained
+    """
+    path = Path(run_folder) / "evaluations.npz"
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: not found; a run folder of `sb3-dtfm train` with evaluations (--eval-freq) is needed.")
+    with np.load(path) as arrays:
+        return Evaluations(arrays["timesteps"], arrays["results"], arrays["successes"] if "successes" in arrays else None)
+
+
+def load_scalar(tensorboard_folder: Path | str, tag: str) -> tuple[np.ndarray, np.ndarray]:
+    """
+    One curve of a TensorBoard log.
+
+    :param tensorboard_folder: folder of the event files of one run
+    :param tag: name of the curve
+    :return: steps (N,) and values (N,), both empty if there is no such curve
+    """
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    accumulator = EventAccumulator(str(tensorboard_folder), size_guidance={"scalars": 0})
+    accumulator.Reload()
+    events = accumulator.Scalars(tag) if tag in accumulator.Tags()["scalars"] else []
+    return np.array([event.step for event in events]), np.array([event.value for event in events])
+
+
+def plot_learning_curve(
+    run_folder: Path | str, output: Path | str, tensorboard_folder: Path | str | None = None, title: str | None = None
+) -> Path:
+    """
+    Draw success (or return) and, next to it, the training loss over gradient steps.
+
+    :param run_folder: folder of one run, as RL-Zoo makes it
+    :param output: PNG file to write
+    :param tensorboard_folder: folder of the run's TensorBoard events; without it there is no loss to draw
+    :param title: heading, by default the run folder's name
+    :return: `output`
+    """
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    evaluations = load_evaluations(run_folder)
+    steps, loss = load_scalar(tensorboard_folder, "train/loss") if tensorboard_folder else (np.array([]), np.array([]))
+    with mpl.rc_context({"font.size": 11, "axes.spines.top": False, "axes.spines.right": False, "axes.axisbelow": True}):
+        n_panels = 2 if len(loss) else 1
+        figure = Figure(figsize=(5.2 * n_panels, 3.9), layout="constrained")
+        axes = figure.subplots(1, n_panels, squeeze=False)[0]
+        if evaluations.successes is not None:
+            _draw_success(axes[0], evaluations)
+        else:
+            _draw_return(axes[0], evaluations)
+        if len(loss):
+            axes[1].plot(steps, loss, color=COLORS["loss"], linewidth=1.8)
+            axes[1].set(ylabel="train/loss", title="training")
+        for axis in axes:
+            axis.set(xlabel="gradient steps", xlim=(0, None))
+            axis.grid(color="0.9")
+        figure.suptitle(title or Path(run_folder).name)
+        Path(output).parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(output, dpi=150)
+    return Path(output)
+
+
+def _draw_success(axis: "Axes", evaluations: Evaluations) -> None:
+    assert evaluations.successes is not None
+    rates = 100 * evaluations.successes.mean(axis=1)
+    n_episodes = evaluations.successes.shape[1]
+    limits = 100 * np.array([wilson_interval(int(row.sum()), n_episodes) for row in evaluations.successes])
+    axis.plot(evaluations.steps, rates, color=COLORS["evaluation"], marker="o", linewidth=1.8)
+    axis.fill_between(evaluations.steps, limits[:, 0], limits[:, 1], color=COLORS["evaluation"], alpha=0.15, linewidth=0)
+    axis.set(ylabel="success rate (%)", ylim=(-2, 102), title=f"evaluation, {n_episodes} episodes, 95 % interval")
+
+
+def _draw_return(axis: "Axes", evaluations: Evaluations) -> None:
+    mean, deviation = evaluations.returns.mean(axis=1), evaluations.returns.std(axis=1)
+    axis.plot(evaluations.steps, mean, color=COLORS["evaluation"], marker="o", linewidth=1.8)
+    axis.fill_between(
+        evaluations.steps, mean - deviation, mean + deviation, color=COLORS["evaluation"], alpha=0.15, linewidth=0
+    )
+    axis.set(ylabel="return", title=f"evaluation, {evaluations.returns.shape[1]} episodes, mean ± std")
+
+
+def main(argv: Sequence[str]) -> None:
+    """
+    Run `sb3-dtfm plot`.
+
+    :param argv: its arguments
+    """
+    parser = argparse.ArgumentParser(
+        prog="sb3-dtfm plot", description="Draw evaluation and training loss of one run of `sb3-dtfm train` into a PNG."
+    )
+    parser.add_argument("run_folder", help="e.g. logs/dtfm/robosuite-Lift-v0_1")
+    parser.add_argument("--tensorboard", metavar="FOLDER", help="folder of the run's TensorBoard events, for the loss")
+    parser.add_argument("--output", metavar="FILE", help="learning_curve.png in the run folder by default")
+    options = parser.parse_args(argv)
+    output = options.output or Path(options.run_folder) / "learning_curve.png"
+    print(f"Learning curve: {plot_learning_curve(options.run_folder, output, options.tensorboard)}")

@@ -1,0 +1,123 @@
+"""Arguments of `sb3-dtfm record`."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+DEMONSTRATORS = ("lift", "can")
+
+EXAMPLES = """\
+examples:
+  sb3-dtfm record --algo tqc --model agent.zip --env HalfCheetah-v5 --episodes 100 --dataset-id local/halfcheetah/expert-v0
+  sb3-dtfm record --demonstrator lift --episodes 200 --output datasets/lift.hdf5
+"""
+
+# Options of each way to record: name, whether it must be given, and what argparse gets.
+AGENT_OPTIONS: dict[str, tuple[bool, dict]] = {
+    "algo": (True, {"help": "algorithm of the agent: any of RL-Zoo's, e.g. sac, tqc, ppo"}),
+    "model": (True, {"metavar": "FILE", "help": "the agent's zip file"}),
+    "env": (True, {"metavar": "ENV", "help": "Gymnasium environment id"}),
+    "dataset_id": (True, {"metavar": "ID", "help": "Minari id to write, e.g. local/halfcheetah/expert-v0"}),
+    "stochastic": (False, {"action": "store_true", "help": "draw actions instead of taking the best"}),
+    "noise": (False, {"type": float, "metavar": "STD", "help": "Gaussian action noise, as a share of half the action range"}),
+    "n_envs": (False, {"type": int, "metavar": "N", "help": "environments side by side"}),
+}
+DEMONSTRATOR_OPTIONS: dict[str, tuple[bool, dict]] = {
+    "output": (True, {"metavar": "FILE", "help": "robomimic hdf5 file to write"}),
+    "workers": (False, {"type": int, "metavar": "N", "help": "processes side by side"}),
+}
+
+
+def record_parser() -> argparse.ArgumentParser:
+    """Arguments of `record`, in one group for each way to record."""
+    parser = argparse.ArgumentParser(
+        prog="sb3-dtfm record",
+        description="Record episodes: of a trained agent into Minari, or of a scripted demonstrator into a robomimic hdf5 file.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--episodes", type=int, required=True, metavar="N", help="episodes to keep")
+    parser.add_argument("--seed", type=int, default=0, help="0 by default")
+    parser.add_argument("--overwrite", action="store_true", help="replace a dataset that is there already")
+    agent = parser.add_argument_group("a trained agent")
+    demonstrator = parser.add_argument_group("a scripted demonstrator")
+    demonstrator.add_argument("--demonstrator", choices=DEMONSTRATORS, help="robosuite task to demonstrate")
+    for group, options in ((agent, AGENT_OPTIONS), (demonstrator, DEMONSTRATOR_OPTIONS)):
+        for name, (_, settings) in options.items():
+            group.add_argument(_flag(name), default=None, **settings)
+    return parser
+
+
+def record(argv: Sequence[str]) -> None:
+    """
+    Run `sb3-dtfm record`.
+
+    :param argv: its arguments
+    """
+    parser = record_parser()
+    options = parser.parse_args(argv)
+    if options.episodes < 1:
+        parser.error(f"argument --episodes: must be at least 1, got {options.episodes}")
+    if options.demonstrator is None:
+        _check(parser, options, AGENT_OPTIONS, DEMONSTRATOR_OPTIONS, "without --demonstrator (recording a trained agent)")
+        _record_agent(parser, options)
+    else:
+        _check(parser, options, DEMONSTRATOR_OPTIONS, AGENT_OPTIONS, f"with --demonstrator {options.demonstrator}")
+        _record_demonstrations(options)
+
+
+def _record_agent(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    from rl_zoo3.utils import ALGOS
+
+    import sb3_dtfm  # noqa: F401  registers the environments
+    from sb3_dtfm.data.record_agent import record_agent
+
+    if options.algo not in ALGOS:
+        parser.error(f"argument --algo: unknown algorithm {options.algo!r} (choose from {', '.join(ALGOS)})")
+    if not Path(options.model).is_file():
+        parser.error(f"argument --model: {options.model} is not a file")
+    optional = {name: value for name in ("noise", "n_envs") if (value := getattr(options, name)) is not None}
+    record_agent(
+        options.algo,
+        options.model,
+        options.env,
+        options.episodes,
+        options.dataset_id,
+        deterministic=not options.stochastic,
+        seed=options.seed,
+        overwrite=options.overwrite,
+        **optional,
+    )
+
+
+def _record_demonstrations(options: argparse.Namespace) -> None:
+    from sb3_dtfm.data.record_demonstrations import record_demonstrations
+
+    record_demonstrations(
+        options.demonstrator,
+        options.episodes,
+        options.output,
+        seed=options.seed,
+        n_workers=options.workers,
+        overwrite=options.overwrite,
+    )
+
+
+def _check(
+    parser: argparse.ArgumentParser,
+    options: argparse.Namespace,
+    wanted: dict[str, tuple[bool, dict]],
+    unwanted: dict[str, tuple[bool, dict]],
+    when: str,
+) -> None:
+    """End with a usage error if an option is missing, or belongs to the other way to record."""
+    missing = [_flag(name) for name, (required, _) in wanted.items() if required and getattr(options, name) is None]
+    if missing:
+        parser.error(f"{', '.join(missing)}: required {when}")
+    misplaced = [_flag(name) for name in unwanted if getattr(options, name) is not None]
+    if misplaced:
+        parser.error(f"{', '.join(misplaced)}: not used {when}")
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
