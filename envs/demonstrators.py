@@ -55,9 +55,15 @@ class Manner:
     noise_memory: float
 
     @classmethod
-    def draw(cls, rng: np.random.Generator) -> "Manner":
+    def draw(cls, rng: np.random.Generator, speed_range: tuple[float, float]) -> "Manner":
+        """
+        A person at random.
+
+        :param rng: source of randomness
+        :param speed_range: between which `speed` is drawn
+        """
         return cls(
-            speed=rng.uniform(0.6, 1.1),
+            speed=rng.uniform(*speed_range),
             time_constant=rng.uniform(0.14, 0.24),
             agility=rng.uniform(0.2, 0.4),
             hover_height=rng.uniform(0.05, 0.09),
@@ -87,6 +93,7 @@ class Demonstrator:
     object_columns = slice(9, 12)  # where the observation holds the object's position
     smallest_grip = 0.012  # metres from the middle to a finger: closed further, it holds nothing
     grasp_height = 0.0  # metres above the object's centre
+    speed_range = (0.55, 0.95)
 
     def __init__(self, seed: int | np.random.SeedSequence | None = None) -> None:
         self._rng = np.random.default_rng(seed)
@@ -94,7 +101,7 @@ class Demonstrator:
 
     def reset(self) -> None:
         """Start another episode in another manner."""
-        self.manner = Manner.draw(self._rng)
+        self.manner = Manner.draw(self._rng, self.speed_range)
         self.stage = "hover"
         self._steps_in_stage = 0
         self._movement = np.zeros(6)
@@ -203,6 +210,7 @@ class CanDemonstrator(Demonstrator):
 
     object_columns = slice(16, 19)
     grasp_height = 0.015
+    speed_range = (0.75, 1.15)  # it has half a metre to go
 
     def _after_grasp(self) -> str:
         return "raise"

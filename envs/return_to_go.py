@@ -22,16 +22,16 @@ def sort_observation_space(space: spaces.Space) -> spaces.Space:
 
     :raises ValueError: a part of the space is an image or has no fixed number of entries
     """
-    if isinstance(space, spaces.Dict):
+    if isinstance(space, spaces.Dict) and len(space) > 0:
         return spaces.Dict({key: sort_observation_space(part) for key, part in space.spaces.items()})
-    if isinstance(space, spaces.Tuple):
+    if isinstance(space, spaces.Tuple) and len(space) > 0:
         return spaces.Tuple([sort_observation_space(part) for part in space.spaces])
     if isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) > 1:
         raise ValueError(f"Observation space {space} holds an image; only vectors of numbers can be used.")
     if not isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
         raise ValueError(
             f"Observation space {space} cannot be flattened to a Box; "
-            "accepted are Box, Discrete, MultiDiscrete, MultiBinary, and Dict and Tuple of these."
+            "accepted are Box, Discrete, MultiDiscrete, MultiBinary, and Dict and Tuple of some of these."
         )
     return space
 
@@ -45,8 +45,7 @@ def flatten_observation_space(space: spaces.Space) -> spaces.Box:
     :raises ValueError: the space holds an image or has no fixed number of entries
     """
     flat = spaces.flatten_space(sort_observation_space(space))
-    if not isinstance(flat, spaces.Box) or len(flat.shape) != 1 or flat.shape[0] == 0:
-        raise ValueError(f"Observation space {space} cannot be flattened to a Box of at least one entry.")
+    assert isinstance(flat, spaces.Box)
     with np.errstate(over="ignore"):
         return spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
 
@@ -71,6 +70,8 @@ def return_to_go_space(observation_space: spaces.Space) -> spaces.Dict:
 
 def check_target_return(target_return: float) -> float:
     """
+    The target as a float.
+
     :param target_return: environment reward units
     :raises ValueError: not a finite number
     """

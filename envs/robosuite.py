@@ -1,28 +1,22 @@
 """robosuite's Lift and Can tasks as Gymnasium environments, with robomimic's low-dimensional observation."""
 
 import json
-import logging
-import os
-import re
-import sys
-import xml.etree.ElementTree as ET
-from collections.abc import Iterator
-from contextlib import contextmanager
-from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-# Our names for the tasks, and robosuite's.
-TASKS = {"Lift": "Lift", "Can": "PickPlaceCan"}
-CONTROL_FREQUENCY = 20  # Hz
-
-# Half extents robosuite draws its cube from, once per compiled model (metres).
-CUBE_SIZE_RANGE = (0.020, 0.022)
-CUBE_DENSITY = 1000.0  # kg / m^3
-CUBE_VISUAL_MASS = 1e-8  # kg, of the cube's second geom, which is only drawn
+from sb3_dtfm.envs.robosuite_scene import (
+    CONTROL_FREQUENCY,
+    CUBE_SIZE_RANGE,
+    TASKS,
+    cube_size,
+    import_robosuite,
+    make_robosuite,
+    scene_xml,
+    set_cube_size,
+)
 
 
 def register_robosuite_envs() -> None:
@@ -93,7 +87,7 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
     :param height: of `rgb_array` frames, pixels
     """
 
-    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": CONTROL_FREQUENCY}
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": CONTROL_FREQUENCY}
 
     def __init__(
         self,
@@ -118,7 +112,7 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
         self.camera_name = camera_name
         self.width = width
         self.height = height
-        self._env = _make_robosuite(task, controller_config, lite_physics)
+        self._env = make_robosuite(task, controller_config, lite_physics)
         self._steps = 0
         self._renderer: Any = None
         self._viewer: Any = None
@@ -136,14 +130,7 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
     @property
     def model_file(self) -> str:
         """MuJoCo XML of the scene with the present cube; asset paths start at robosuite's package, as robomimic expects."""
-        xml = self._xml
-        if self.task == "Lift":
-            root = ET.fromstring(xml)
-            for geom in root.iter("geom"):
-                if geom.get("name", "").startswith("cube_g0"):
-                    geom.set("size", " ".join(repr(float(half)) for half in self._env.cube.size))
-            xml = ET.tostring(root, encoding="unicode")
-        return xml
+        return scene_xml(self._env)
 
     @property
     def env_args(self) -> dict[str, Any]:
@@ -167,9 +154,7 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
             },
         }
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """
         Draw a new start, or take a recorded one.
 
@@ -182,11 +167,11 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
         self._steps = 0
         if options is not None and "state" in options:
             if self.task == "Lift" and options.get("model_file") is not None:
-                self._set_cube_size(_cube_size(options["model_file"]))
+                set_cube_size(self._env, cube_size(options["model_file"]))
             self._start_from(np.asarray(options["state"], np.float64))
         else:
             if self.task == "Lift":
-                self._set_cube_size(self.np_random.uniform(*CUBE_SIZE_RANGE, size=3))
+                set_cube_size(self._env, self.np_random.uniform(*CUBE_SIZE_RANGE, size=3))
             self._env.rng = self.np_random
             for sampler in self._placement_samplers:
                 sampler.rng = self.np_random
@@ -265,32 +250,6 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
         }
         placement = env.placement_initializer
         self._placement_samplers = [placement, *getattr(placement, "samplers", {}).values()]
-        package = os.path.dirname(import_robosuite().__file__ or "")
-        self._xml = re.sub(r'file="' + re.escape(package), 'file="robosuite', env.edit_model_xml(env.model.get_xml()))
-
-    def _set_cube_size(self, size: np.ndarray) -> None:
-        """
-        Give the compiled cube another size, which costs a thousandth of compiling the scene anew.
-
-        :param size: (3,) half extents, metres
-        """
-        import mujoco
-
-        self._env.cube.size = [float(half) for half in size]
-        model = self._env.sim.model._model
-        body = self._object_body
-        first_geom, n_geoms = model.body_geomadr[body], model.body_geomnum[body]
-        geoms = slice(first_geom, first_geom + n_geoms)
-        model.geom_size[geoms] = size
-        model.geom_rbound[geoms] = np.linalg.norm(size)
-        model.geom_aabb[geoms, 3:] = size
-        first_node = model.body_bvhadr[body]
-        model.bvh_aabb[first_node : first_node + model.body_bvhnum[body], 3:] = size
-        mass = CUBE_DENSITY * 8.0 * np.prod(size) + CUBE_VISUAL_MASS
-        squares = np.square(size)
-        model.body_mass[body] = mass
-        model.body_inertia[body] = mass / 3.0 * (squares.sum() - squares)
-        mujoco.mj_setConst(model, self._env.sim.data._data)
 
     def _start_from(self, state: np.ndarray) -> None:
         """
@@ -353,73 +312,3 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
             object_state = [*relative, position, quaternion]
         gripper = data.qpos[self._gripper_qpos]
         return np.concatenate([eef_position, eef_quaternion, gripper, *object_state]).astype(np.float32)
-
-
-def import_robosuite() -> ModuleType:
-    """
-    robosuite, imported without its messages and without its choice of a rendering backend for the whole process.
-
-    :raises ImportError: not installed; says which extra installs it
-    """
-    if "robosuite" in sys.modules:
-        return sys.modules["robosuite"]
-    rendering_backend = os.environ.get("MUJOCO_GL")
-    try:
-        with _silence():
-            import robosuite
-    except ImportError as error:
-        raise ImportError(
-            f'The robosuite environments need robosuite, which cannot be imported ({error}): pip install "sb3-dtfm[robosuite]"'
-        ) from error
-    finally:
-        if rendering_backend is None:
-            os.environ.pop("MUJOCO_GL", None)
-        else:
-            os.environ["MUJOCO_GL"] = rendering_backend
-    return robosuite
-
-
-@contextmanager
-def _silence() -> Iterator[None]:
-    """Hold back robosuite's log messages below errors."""
-    logger = logging.getLogger("robosuite_logs")
-
-    def is_error(record: logging.LogRecord) -> bool:
-        return record.levelno >= logging.ERROR
-
-    logger.addFilter(is_error)
-    try:
-        yield
-    finally:
-        logger.removeFilter(is_error)
-
-
-def _make_robosuite(task: str, controller_config: dict[str, Any] | None, lite_physics: bool) -> Any:
-    robosuite = import_robosuite()
-    from robosuite.controllers.composite.composite_controller_factory import refactor_composite_controller_config
-
-    with _silence():
-        if controller_config is not None:
-            controller_config = refactor_composite_controller_config(controller_config, "Panda", ["right"])
-        return robosuite.make(
-            TASKS[task],
-            robots="Panda",
-            controller_configs=controller_config,
-            control_freq=CONTROL_FREQUENCY,
-            lite_physics=lite_physics,
-            use_camera_obs=False,
-            has_renderer=False,
-            has_offscreen_renderer=False,
-            renderer="mujoco",  # none is opened; the default one would read a viewer's settings from disk
-            hard_reset=False,
-            ignore_done=True,
-            seed=0,
-        )
-
-
-def _cube_size(model_file: str) -> np.ndarray:
-    """Half extents of the cube in a Lift scene's XML, (3,) metres."""
-    for geom in ET.fromstring(model_file).iter("geom"):
-        if geom.get("name") == "cube_g0":
-            return np.array(geom.get("size", "").split(), np.float64)
-    raise ValueError("model_file holds no geom named 'cube_g0'; a robosuite Lift scene is expected.")

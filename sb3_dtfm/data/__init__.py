@@ -10,6 +10,7 @@ from typing import Any
 from minari import MinariDataset
 
 from sb3_dtfm.data.minari import load_minari
+from sb3_dtfm.data.robomimic import load_robomimic
 from sb3_dtfm.data.trajectories import (
     DatasetError,
     ScoreReference,
@@ -57,8 +58,6 @@ def _find_reader(dataset: Any) -> tuple[Callable[..., TrajectoryBuffer], Any]:
         raise DatasetError(f"dataset is a {type(dataset).__name__}; accepted are {ACCEPTED}.")
     path = Path(dataset).expanduser()
     if path.is_file():
-        from sb3_dtfm.data.robomimic import load_robomimic
-
         return load_robomimic, path
     if isinstance(dataset, os.PathLike) or dataset.endswith(HDF5_SUFFIXES) or dataset.startswith((".", "~", os.sep)):
         problem = "is a folder" if path.is_dir() else "does not exist"
@@ -76,5 +75,6 @@ __all__ = [
     "TrajectoryBuffer",
     "load_dataset",
     "load_minari",
+    "load_robomimic",
     "returns_to_go",
 ]

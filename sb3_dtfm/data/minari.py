@@ -17,6 +17,7 @@ from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory,
 from sb3_dtfm.envs.return_to_go import flatten_observation_space, sort_observation_space
 
 HDF5_FILE_NAME = "main_data.hdf5"
+EPISODE_KEYS = ("observations", "actions", "rewards", "terminations", "truncations")
 
 
 def load_minari(dataset: str | minari.MinariDataset) -> TrajectoryBuffer:
@@ -39,10 +40,10 @@ def load_minari(dataset: str | minari.MinariDataset) -> TrajectoryBuffer:
         observation_space = flatten_observation_space(dataset.observation_space)
     except ValueError as error:
         raise DatasetError(f"{source}: {error}") from error
-    episodes = _Hdf5Episodes(dataset, hdf5_file) if in_hdf5 else _StorageEpisodes(dataset)
+    episodes = _Hdf5Episodes(dataset, source, hdf5_file) if in_hdf5 else _StorageEpisodes(dataset, source)
     try:
         return TrajectoryBuffer.from_trajectories(
-            episodes.trajectories(source),
+            episodes.trajectories(),
             action_space,
             observation_space,
             lengths=episodes.lengths(),
@@ -88,6 +89,8 @@ def _download(dataset_id: str) -> None:
 
 def check_action_space(space: spaces.Space, source: str) -> spaces.Box:
     """
+    The action space, if actions from it can be learnt.
+
     :raises DatasetError: not a bounded Box of shape (A,)
     """
     if not isinstance(space, spaces.Box) or len(space.shape) != 1 or not space.is_bounded():
@@ -108,36 +111,47 @@ def score_reference(dataset: minari.MinariDataset) -> ScoreReference | None:
 class _Hdf5Episodes:
     """Reads the HDF5 file itself, since Minari's storage decodes all infos with every episode."""
 
-    def __init__(self, dataset: minari.MinariDataset, file: Path) -> None:
+    def __init__(self, dataset: minari.MinariDataset, source: str, path: Path) -> None:
         self.dataset = dataset
-        self.file = file
+        self.source = source
+        self.path = path
 
     def lengths(self) -> list[int]:
         """Steps of each episode."""
-        with h5py.File(self.file, "r") as file:
-            return [len(file[f"episode_{index}/rewards"]) for index in self.dataset.episode_indices]
+        with h5py.File(self.path, "r") as file:
+            return [self._length(file, index) for index in self.dataset.episode_indices]
 
-    def trajectories(self, source: str) -> Iterator[Trajectory]:
-        with h5py.File(self.file, "r") as file:
+    def trajectories(self) -> Iterator[Trajectory]:
+        with h5py.File(self.path, "r") as file:
             for index in self.dataset.episode_indices:
-                yield make_trajectory(file[f"episode_{index}"], self.dataset.observation_space, f"episode {index}", source)
+                episode = file[f"episode_{index}"]
+                yield make_trajectory(episode, self.dataset.observation_space, f"episode {index}", self.source)
+
+    def _length(self, file: h5py.File, index: int) -> int:
+        episode = file.get(f"episode_{index}", {})
+        keys = set(episode)
+        missing = [key for key in EPISODE_KEYS if key not in keys]
+        if missing:
+            raise DatasetError(f"{self.source}, episode {index}: holds no {', '.join(missing)}; the file is incomplete.")
+        return len(episode["rewards"])
 
 
 class _StorageEpisodes:
     """Reads through Minari's storage: Arrow and Parquet."""
 
-    def __init__(self, dataset: minari.MinariDataset) -> None:
+    def __init__(self, dataset: minari.MinariDataset, source: str) -> None:
         self.dataset = dataset
+        self.source = source
 
     def lengths(self) -> list[int]:
         """Steps of each episode."""
         metadata = self.dataset.storage.get_episode_metadata(self.dataset.episode_indices)
         return [int(episode["total_steps"]) for episode in metadata]
 
-    def trajectories(self, source: str) -> Iterator[Trajectory]:
+    def trajectories(self) -> Iterator[Trajectory]:
         episodes = self.dataset.storage.get_episodes(self.dataset.episode_indices)
         for index, episode in zip(self.dataset.episode_indices, episodes, strict=True):
-            yield make_trajectory(episode, self.dataset.observation_space, f"episode {index}", source)
+            yield make_trajectory(episode, self.dataset.observation_space, f"episode {index}", self.source)
 
 
 def make_trajectory(episode: Mapping[str, Any], observation_space: spaces.Space, name: str, source: str) -> Trajectory:
@@ -159,9 +173,9 @@ def make_trajectory(episode: Mapping[str, Any], observation_space: spaces.Space,
             f"{n_steps + 1} or {n_steps} are accepted."
         )
     return Trajectory(
-        observations=np.concatenate([column[:n_steps] for column in columns], axis=1),
-        actions=np.asarray(episode["actions"]),
-        rewards=np.asarray(episode["rewards"], dtype=np.float64),
+        observations=np.concatenate(columns, axis=1)[:n_steps] if len(columns) > 1 else columns[0][:n_steps],
+        actions=episode["actions"][:],
+        rewards=np.asarray(episode["rewards"][:], dtype=np.float64),
         terminated=bool(n_steps and episode["terminations"][-1]),
         truncated=bool(n_steps and episode["truncations"][-1]),
         name=name,
@@ -182,7 +196,7 @@ def flatten_observations(data: Any, space: spaces.Space) -> list[np.ndarray]:
         parts: Any = [data[f"_index_{i}"] for i in range(len(space))] if isinstance(data, h5py.Group) else data
         columns = [flatten_observations(entry, part) for entry, part in zip(parts, space.spaces, strict=True)]
         return list(itertools.chain.from_iterable(columns))
-    values = np.asarray(data)
+    values = np.asarray(data[:])
     if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
         return [np.stack([np.asarray(spaces.flatten(space, value)) for value in values])]
     return [values.reshape(len(values), -1)]

@@ -5,6 +5,7 @@ import importlib
 import inspect
 import shutil
 import tempfile
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,9 @@ from typing import Any
 import gymnasium as gym
 import minari
 import numpy as np
+import torch as th
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from minari.dataset.minari_dataset import parse_dataset_id
 from minari.dataset.minari_storage import MinariStorage
 from minari.namespace import create_namespace, list_local_namespaces
@@ -103,14 +106,19 @@ def record_agent(
             "num_episodes_average_score": n_episodes,
         }
         episodes = show_progress(run_episodes(envs, act, n_episodes, seed), n_episodes, progress)
-        return write_dataset(dataset_id, episodes, env, metadata)
+        with one_thread():
+            return write_dataset(dataset_id, episodes, env, metadata)
     finally:
         for each in envs:
             each.close()
 
 
 def check_arguments(n_episodes: int, noise: float, n_envs: int) -> None:
-    """:raises ValueError: names the argument, what was given and what is accepted"""
+    """
+    Refuse numbers out of range.
+
+    :raises ValueError: names the argument, what was given and what is accepted
+    """
     if n_episodes < 1:
         raise ValueError(f"n_episodes must be at least 1, got {n_episodes}.")
     if n_envs < 1:
@@ -120,7 +128,11 @@ def check_arguments(n_episodes: int, noise: float, n_envs: int) -> None:
 
 
 def check_dataset_id(dataset_id: str, overwrite: bool) -> None:
-    """:raises DatasetError: malformed, or there is such a dataset and `overwrite` is not set"""
+    """
+    Refuse an id that cannot be written.
+
+    :raises DatasetError: malformed, or there is such a dataset and `overwrite` is not set
+    """
     try:
         parse_dataset_id(dataset_id)
     except (ValueError, TypeError) as error:
@@ -132,6 +144,8 @@ def check_dataset_id(dataset_id: str, overwrite: bool) -> None:
 
 def find_algorithm(algo: str) -> type[BaseAlgorithm]:
     """
+    The class of an agent by its name.
+
     :param algo: class name in any case, or RL-Zoo's name for it
     :raises ValueError: unknown; names those that are known
     """
@@ -165,7 +179,11 @@ def load_agent(algo: str, model_path: str | Path, device: str) -> BaseAlgorithm:
 
 
 def check_agent_fits(model: BaseAlgorithm, env: gym.Env, model_path: str | Path, env_id: str) -> None:
-    """:raises ValueError: names both observation or action spaces"""
+    """
+    Refuse an agent that was trained on another task.
+
+    :raises ValueError: names the spaces of both
+    """
     for kind in ("observation_space", "action_space"):
         agent_space, env_space = getattr(model, kind), getattr(env, kind)
         if _shapes(agent_space) != _shapes(env_space):
@@ -222,11 +240,34 @@ def agent_actions(
     return act
 
 
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Run torch on one thread: for a small network and a few rows, several spend their time waiting for one another."""
+    n_threads = th.get_num_threads()
+    th.set_num_threads(1)
+    try:
+        yield
+    finally:
+        th.set_num_threads(n_threads)
+
+
 def episode_generators(
     generators: dict[int, np.random.Generator], episodes: list[int], seed: list[int]
 ) -> dict[int, np.random.Generator]:
     """The generators of the running episodes: those there are, new ones for new episodes, none for finished ones."""
     return {episode: generators.get(episode) or np.random.default_rng([*seed, episode]) for episode in episodes}
+
+
+def storable_spec(env: gym.Env) -> EnvSpec | None:
+    """The environment's spec if it can be written to a file; the dataset can do without it."""
+    if env.spec is None:
+        return None
+    try:
+        env.spec.to_json()
+    except (TypeError, ValueError) as error:
+        warnings.warn(f"The environment cannot be recovered from the dataset: {error}", stacklevel=2)
+        return None
+    return env.spec
 
 
 def write_dataset(
@@ -245,7 +286,7 @@ def write_dataset(
     staging = Path(tempfile.mkdtemp(prefix=".recording-", dir=get_dataset_path()))
     try:
         (staging / "new").mkdir()
-        storage = MinariStorage.new(staging / "new" / "data", env.observation_space, env.action_space, env.spec)
+        storage = MinariStorage.new(staging / "new" / "data", env.observation_space, env.action_space, storable_spec(env))
         storage.update_metadata({"dataset_id": dataset_id, "minari_version": minari.__version__})
         returns = []
         for episode in episodes:

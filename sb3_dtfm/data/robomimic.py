@@ -28,11 +28,11 @@ def load_robomimic(
     """
     The demonstrations of a robomimic hdf5 file, of robosuite 1.4 or 1.5.
 
-    Rewards are those of :class:`~sb3_dtfm.envs.robosuite.RobosuiteEnv`, whose episode ends at the first success: where a file
-    has rewards of 0 and 1 only, an episode is cut after its first 1, so that its return is 1 (robomimic's recordings often
-    go on for some steps), and is `terminated`. Without success it is `truncated` if the file marks its end as done. Where no
-    episode of the file has any reward, or none has been stored, the first step that is done counts as the success, or the
-    last step if nothing is marked as done. Other rewards (dense ones) are kept as they are.
+    Rewards are those of :class:`~sb3_dtfm.envs.robosuite.RobosuiteEnv`, whose episode ends at the first success: where a
+    file has rewards of 0 and 1 only, an episode is cut after its first 1, so that its return is 1 (robomimic's recordings
+    often go on for some steps), and is `terminated`. Without success it is `truncated` if the file marks its end as done.
+    Where no episode of the file has any reward, or none has been stored, the first step that is done counts as the
+    success, or the last step if nothing is marked as done. Other rewards (dense ones) are kept as they are.
 
     The `object` observation of robosuite <= 1.4 is brought into the present form, which the environment shows too: Lift's
     gripper-to-cube vector had the opposite sign, and Can's two poses the opposite order.
@@ -42,8 +42,8 @@ def load_robomimic(
     :param observation_keys: which of a demonstration's `obs` make up the observation, in this order; robomimic's
         low-dimensional ones by default
     :return: actions in the controller's input range, [-1, 1] if the file says nothing else
-    :raises DatasetError: no such file, not readable, nothing in it, unknown keys, wrong shapes, NaN or infinity, or actions out
-        of range; names the file, the demonstration and the step
+    :raises DatasetError: no such file, not readable, nothing in it, unknown keys, wrong shapes, NaN or infinity, or actions
+        out of range; names the file, the demonstration and the step
     """
     source = str(path)
     try:
@@ -72,19 +72,19 @@ def _read(file: h5py.File, source: str, filter_key: str | None, observation_keys
     env_args = _env_args(data, source)
     steps = {name: _n_steps(data[name], f"{source}, {name}") for name in all_demos}
     labels = {name: _labels(data[name], f"{source}, {name}", steps[name]) for name in all_demos}
-    labels = _sparse_on_success(labels)
+    rewards = _rewards(labels, steps)
     n_actions = data[demos[0]]["actions"].shape[1]
 
     def trajectories() -> Iterator[Trajectory]:
         for name in demos:
-            rewards, dones = labels[name]
-            observations = _observations(data[name], f"{source}, {name}", steps[name], observation_keys, env_args)
-            success = bool(rewards[-1] == 1.0)
-            done = bool(dones is not None and dones[len(rewards) - 1])
+            length, dones = len(rewards[name]), labels[name][1]
+            observations = _observations(data[name], f"{source}, {name}", steps[name], observation_keys)
+            success = bool(rewards[name][-1] >= 1.0)
+            done = dones is not None and bool(dones[length - 1])
             yield Trajectory(
-                observations=observations[: len(rewards)],
-                actions=np.asarray(data[name]["actions"][: len(rewards)]),
-                rewards=rewards,
+                observations=_present_object_state(observations, observation_keys, env_args)[:length],
+                actions=np.asarray(data[name]["actions"][:length]),
+                rewards=rewards[name],
                 terminated=success,
                 truncated=done and not success,
                 name=name,
@@ -93,7 +93,7 @@ def _read(file: h5py.File, source: str, filter_key: str | None, observation_keys
     return TrajectoryBuffer.from_trajectories(
         trajectories(),
         action_space=_action_space(env_args, n_actions, source),
-        lengths=[len(labels[name][0]) for name in demos],
+        lengths=[len(rewards[name]) for name in demos],
         source=source,
     )
 
@@ -136,7 +136,9 @@ def _n_steps(demo: h5py.Group, where: str) -> int:
     if not isinstance(actions, h5py.Dataset):
         raise DatasetError(f"{where}: has no 'actions', only {_listed(demo)}.")
     if actions.ndim != 2 or len(actions) == 0:
-        raise DatasetError(f"{where}: actions have shape {actions.shape}, expected (steps, dimensions) of at least one step.")
+        raise DatasetError(
+            f"{where}: actions have shape {actions.shape}, expected (steps, dimensions) of at least one step."
+        )
     return len(actions)
 
 
@@ -154,13 +156,191 @@ def _labels(demo: h5py.Group, where: str, n_steps: int) -> tuple[np.ndarray | No
     return labels[0], labels[1]
 
 
-def _sparse_on_success(
-    labels: dict[str, tuple[np.ndarray | None, np.ndarray | None]],
-) -> dict[str, tuple[np.ndarray, np.ndarray | None]]:
+def _rewards(labels: dict[str, tuple[np.ndarray | None, np.ndarray | None]], steps: dict[str, int]) -> dict[str, np.ndarray]:
     """Rewards as the environment gives them, cut after the first success; see :func:`load_robomimic`."""
-    rewarded = any(rewards is not None and np.any(rewards != 0) for rewards, _ in labels.values())
-    binary = all(rewards is None or np.isin(rewards, (0, 1)).all() for rewards, _ in labels.values())
-    sparse: dict[str, tuple[np.ndarray, np.ndarray | None]] = {}
-    for name, (rewards, dones) in labels.items():
-        return
-    return sparse
+    stored = {name: np.zeros(steps[name]) if array is None else array.astype(float) for name, (array, _) in labels.items()}
+    if not all(np.isin(array, (0.0, 1.0)).all() for array in stored.values()):
+        return stored
+    rewarded = any(array.any() for array in stored.values())
+    rewards = {}
+    for name, array in stored.items():
+        dones = labels[name][1]
+        marks = array if rewarded or dones is None else dones
+        successes = np.flatnonzero(marks)
+        if len(successes) == 0 and rewarded:
+            rewards[name] = array
+            continue
+        length = int(successes[0]) + 1 if len(successes) else steps[name]
+        rewards[name] = np.zeros(length)
+        rewards[name][-1] = 1.0
+    return rewards
+
+
+def _observations(demo: h5py.Group, where: str, n_steps: int, keys: tuple[str, ...]) -> np.ndarray:
+    """The chosen observations side by side, (T, O)."""
+    group = demo.get("obs")
+    if not isinstance(group, h5py.Group):
+        raise DatasetError(f"{where}: has no group 'obs', only {_listed(demo)}; observations must be in the file.")
+    parts = []
+    for key in keys:
+        name = key if key in group else ALIASES.get(key, key)
+        if name not in group:
+            raise DatasetError(f"{where}: has no observation {key!r}; available: {_listed(group)}.")
+        array = np.asarray(group[name][()])
+        if array.ndim == 1:
+            array = array[:, None]
+        if array.ndim != 2 or len(array) != n_steps:
+            raise DatasetError(
+                f"{where}: observation {name!r} has shape {array.shape}, expected ({n_steps}, dimensions), "
+                "one row for each action."
+            )
+        parts.append(array)
+    return np.concatenate(parts, axis=1)
+
+
+def _present_object_state(observations: np.ndarray, keys: tuple[str, ...], env_args: dict[str, Any]) -> np.ndarray:
+    """
+    The object's part as robosuite 1.5 has it, where the numbers show that an older robosuite wrote it.
+
+    :param observations: (T, O)
+    """
+    version = [int(number) for number in re.findall(r"\d+", str(env_args.get("env_version", "")))[:2]]
+    if keys != DEFAULT_OBSERVATION_KEYS or not version or version >= [1, 5]:
+        return observations
+    hand, quaternion, state = observations[:, :3], observations[:, 3:7], observations[:, 9:]
+    task = (env_args.get("env_name"), state.shape[1])
+    if task == ("Lift", 10) and np.allclose(state[:, 7:], hand - state[:, :3], atol=OLD_LAYOUT_TOLERANCE):
+        return np.concatenate([observations[:, :16], -observations[:, 16:]], axis=1)
+    if task == ("PickPlaceCan", 14):
+        in_hand = _in_frame(state[:, :3] - hand, quaternion)
+        if np.allclose(state[:, 7:10], in_hand, atol=OLD_LAYOUT_TOLERANCE):
+            return np.concatenate([observations[:, :9], state[:, 7:], state[:, :7]], axis=1)
+    return observations
+
+
+def _in_frame(vectors: np.ndarray, quaternions: np.ndarray) -> np.ndarray:
+    """
+    World vectors seen from rotated frames.
+
+    :param vectors: (T, 3)
+    :param quaternions: (T, 4) orientations of the frames, x y z w
+    """
+    axes, scalars = -quaternions[:, :3], quaternions[:, 3:]
+    crossed = 2.0 * np.cross(axes, vectors)
+    return np.asarray(vectors + scalars * crossed + np.cross(axes, crossed))
+
+
+def _action_space(env_args: dict[str, Any], n_actions: int, source: str) -> spaces.Box:
+    """The controller's input range for the arm, [-1, 1] for the gripper and where the file says nothing."""
+    config = env_args.get("env_kwargs", {}).get("controller_configs") or {}
+    config = config[0] if isinstance(config, list) else config
+    arm = config.get("body_parts", {}).get("right", config)
+    if arm.get("input_type", "delta") != "delta" or arm.get("control_delta", True) is False:
+        raise DatasetError(f"{source}: actions are absolute poses; only files with a delta controller are accepted.")
+    low, high = -np.ones(n_actions, np.float32), np.ones(n_actions, np.float32)
+    low[: n_actions - 1], high[: n_actions - 1] = arm.get("input_min", -1.0), arm.get("input_max", 1.0)
+    return spaces.Box(low, high, dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class RecordedEpisode:
+    """
+    One episode for :class:`RobomimicWriter`.
+
+    :param observations: (T + 1, d) for each observation key
+    :param actions: (T, A)
+    :param rewards: (T,), environment reward units
+    :param states: (T, S) simulator state before each action
+    :param model_file: XML of the simulated scene
+    """
+
+    observations: dict[str, np.ndarray]
+    actions: np.ndarray
+    rewards: np.ndarray
+    states: np.ndarray
+    model_file: str
+
+
+class RobomimicWriter:
+    """
+    Writes one file in robomimic's layout, which appears under its name only when complete.
+
+    Use it as a context manager; if the block fails, nothing is left behind. Filter keys `train`, `valid` (a tenth) and
+    `50_percent` are drawn from `seed`.
+
+    :param path: the file; its folder is made if necessary
+    :param env_args: description of the environment, stored as JSON
+    :param overwrite: replace an existing file
+    :param seed: of the filter keys
+    :raises FileExistsError: the file exists and is not to be overwritten
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], env_args: dict[str, Any], overwrite: bool = False, seed: int = 0
+    ) -> None:
+        self.path = Path(path)
+        self._env_args = env_args
+        self._seed = seed
+        self._n_episodes = 0
+        self._n_steps = 0
+        refuse_existing(self.path, overwrite)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+
+    def __enter__(self) -> "RobomimicWriter":
+        handle, name = tempfile.mkstemp(dir=self.path.parent, prefix=f".{self.path.name}.", suffix=".part")
+        os.close(handle)
+        self._temporary = Path(name)
+        self._file = h5py.File(self._temporary, "w")
+        self._data = self._file.create_group("data")
+        return self
+
+    def add(self, episode: RecordedEpisode) -> None:
+        """Append an episode as the next `demo_<i>`."""
+        demo = self._data.create_group(f"demo_{self._n_episodes}")
+        n_steps = len(episode.actions)
+        dones = np.zeros(n_steps, np.int64)
+        dones[-1] = 1
+        for key, values in episode.observations.items():
+            demo[f"obs/{key}"] = values[:-1]
+            demo[f"next_obs/{key}"] = values[1:]
+        demo["actions"] = episode.actions
+        demo["rewards"] = episode.rewards
+        demo["dones"] = dones
+        demo["states"] = episode.states
+        demo.attrs["num_samples"] = n_steps
+        demo.attrs["model_file"] = episode.model_file
+        self._n_episodes += 1
+        self._n_steps += n_steps
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        try:
+            if kind is None:
+                self._finish()
+        finally:
+            self._file.close()
+            self._temporary.unlink(missing_ok=True)
+
+    def _finish(self) -> None:
+        self._data.attrs["total"] = self._n_steps
+        self._data.attrs["env_args"] = json.dumps(self._env_args, indent=4)
+        order = np.random.default_rng(self._seed).permutation(self._n_episodes)
+        n_valid = round(VALIDATION_SHARE * self._n_episodes)
+        masks = {"train": order[n_valid:], "valid": order[:n_valid], "50_percent": order[: (self._n_episodes + 1) // 2]}
+        for key, episodes in masks.items():
+            names = [f"demo_{episode}" for episode in np.sort(episodes)]
+            self._file[f"mask/{key}"] = np.array(names, dtype="S")
+        self._file.close()
+        mask = os.umask(0)
+        os.umask(mask)
+        self._temporary.chmod(0o666 & ~mask)  # a temporary file is private to its owner, an ordinary one is not
+        os.replace(self._temporary, self.path)
+
+
+def refuse_existing(path: Path, overwrite: bool) -> None:
+    """
+    :raises FileExistsError: `path` exists and is not to be overwritten, or is a folder
+    """
+    if path.is_dir():
+        raise FileExistsError(f"{path} is a folder; the path of a file is expected.")
+    if path.exists() and not overwrite:
+        raise FileExistsError(f"{path} exists already; pass overwrite=True (--overwrite) to replace it.")

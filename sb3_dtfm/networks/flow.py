@@ -30,14 +30,16 @@ def interpolate(noise: th.Tensor, action: th.Tensor, tau: th.Tensor) -> tuple[th
 
 def sinusoidal_embedding(tau: th.Tensor, embedding_dim: int) -> th.Tensor:
     """
-    Sines and cosines of tau at frequencies from 1 to 1000 rad per unit, geometrically spaced.
+    Sines and cosines of tau at frequencies from 1 to 100 rad, geometrically spaced.
+
+    Higher ones would change faster than a solver's step can follow.
 
     :param tau: (...) in [0, 1]
     :param embedding_dim: even
     :return: (..., embedding_dim)
     """
     half = embedding_dim // 2
-    frequencies = th.exp(th.linspace(0.0, math.log(1000.0), half, device=tau.device))
+    frequencies = th.exp(th.linspace(0.0, math.log(100.0), half, device=tau.device))
     angles = tau.unsqueeze(-1) * frequencies
     return th.cat((angles.sin(), angles.cos()), dim=-1)
 

@@ -79,7 +79,7 @@ def _shorthands(options: argparse.Namespace) -> list[tuple[str, str]]:
 
 def enjoy_arguments(argv: Sequence[str]) -> list[str]:
     """
-    Arguments for RL-Zoo's `enjoy`: dt and dtfm are looked for where `train` puts them, not among the Zoo's own trained agents.
+    Arguments for RL-Zoo's `enjoy`: dt and dtfm are looked for where `train` puts them, not among the Zoo's own agents.
 
     :param argv: the user's arguments
     """

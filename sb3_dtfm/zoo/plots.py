@@ -16,7 +16,7 @@ COLORS = {"evaluation": "#1b6ca8", "loss": "#c0562b"}
 
 class Evaluations(NamedTuple):
     """
-    What RL-Zoo's evaluations during training found, at each of E gradient steps with n episodes.
+    What evaluations of n episodes each found at E gradient steps.
 
     Shapes: steps (E,), returns (E, n) in environment reward units, successes (E, n) bool or None where a task has no success.
     """
@@ -40,9 +40,9 @@ def load_evaluations(run_folder: Path | str) -> Evaluations:
     """
     path = Path(run_folder) / "evaluations.npz"
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: not found; a run folder of `sb3-dtfm train` with evaluations (--eval-freq) is needed.")
+        raise FileNotFoundError(f"{path} does not exist; expected the folder of a run with evaluations (train --eval-freq).")
     with np.load(path) as arrays:
-        return Evaluations(arrays["timesteps"], arrays["results"], arrays["successes"] if "successes" in arrays else None)
+        return Evaluations(arrays["timesteps"], arrays["results"], arrays.get("successes"))
 
 
 def load_scalar(tensorboard_folder: Path | str, tag: str) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 DEMONSTRATORS = ("lift", "can")
 
@@ -14,12 +13,12 @@ examples:
 
 # Options of each way to record: name, whether it must be given, and what argparse gets.
 AGENT_OPTIONS: dict[str, tuple[bool, dict]] = {
-    "algo": (True, {"help": "algorithm of the agent: any of RL-Zoo's, e.g. sac, tqc, ppo"}),
+    "algo": (True, {"help": "algorithm of the agent, e.g. sac, tqc, ppo"}),
     "model": (True, {"metavar": "FILE", "help": "the agent's zip file"}),
     "env": (True, {"metavar": "ENV", "help": "Gymnasium environment id"}),
     "dataset_id": (True, {"metavar": "ID", "help": "Minari id to write, e.g. local/halfcheetah/expert-v0"}),
     "stochastic": (False, {"action": "store_true", "help": "draw actions instead of taking the best"}),
-    "noise": (False, {"type": float, "metavar": "STD", "help": "Gaussian action noise, as a share of half the action range"}),
+    "noise": (False, {"type": float, "metavar": "STD", "help": "Gaussian action noise, as a share of the action range"}),
     "n_envs": (False, {"type": int, "metavar": "N", "help": "environments side by side"}),
 }
 DEMONSTRATOR_OPTIONS: dict[str, tuple[bool, dict]] = {
@@ -32,7 +31,7 @@ def record_parser() -> argparse.ArgumentParser:
     """Arguments of `record`, in one group for each way to record."""
     parser = argparse.ArgumentParser(
         prog="sb3-dtfm record",
-        description="Record episodes: of a trained agent into Minari, or of a scripted demonstrator into a robomimic hdf5 file.",
+        description="Record episodes of a trained agent into Minari, or of a scripted demonstrator into a robomimic file.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -60,24 +59,17 @@ def record(argv: Sequence[str]) -> None:
         parser.error(f"argument --episodes: must be at least 1, got {options.episodes}")
     if options.demonstrator is None:
         _check(parser, options, AGENT_OPTIONS, DEMONSTRATOR_OPTIONS, "without --demonstrator (recording a trained agent)")
-        _record_agent(parser, options)
+        _record_agent(options)
     else:
         _check(parser, options, DEMONSTRATOR_OPTIONS, AGENT_OPTIONS, f"with --demonstrator {options.demonstrator}")
         _record_demonstrations(options)
 
 
-def _record_agent(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    from rl_zoo3.utils import ALGOS
-
-    import sb3_dtfm  # noqa: F401  registers the environments
+def _record_agent(options: argparse.Namespace) -> None:
     from sb3_dtfm.data.record_agent import record_agent
 
-    if options.algo not in ALGOS:
-        parser.error(f"argument --algo: unknown algorithm {options.algo!r} (choose from {', '.join(ALGOS)})")
-    if not Path(options.model).is_file():
-        parser.error(f"argument --model: {options.model} is not a file")
     optional = {name: value for name in ("noise", "n_envs") if (value := getattr(options, name)) is not None}
-    record_agent(
+    dataset = record_agent(
         options.algo,
         options.model,
         options.env,
@@ -88,12 +80,13 @@ def _record_agent(parser: argparse.ArgumentParser, options: argparse.Namespace) 
         overwrite=options.overwrite,
         **optional,
     )
+    print(f"Recorded {dataset.total_episodes} episodes, {dataset.total_steps} steps: {dataset.id}")
 
 
 def _record_demonstrations(options: argparse.Namespace) -> None:
     from sb3_dtfm.data.record_demonstrations import record_demonstrations
 
-    record_demonstrations(
+    summary = record_demonstrations(
         options.demonstrator,
         options.episodes,
         options.output,
@@ -101,6 +94,7 @@ def _record_demonstrations(options: argparse.Namespace) -> None:
         n_workers=options.workers,
         overwrite=options.overwrite,
     )
+    print(summary)
 
 
 def _check(

@@ -7,16 +7,17 @@ from typing import Any
 import optuna
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_dtfm import DT, DTFM
 
-OFFLINE_ALGORITHMS = {"dt": DT, "dtfm": DTFM}
+OFFLINE_ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"dt": DT, "dtfm": DTFM}
 
 # What `--conf-file` accepts besides files and Python packages; None is no `--conf-file` at all.
 PACKAGED_CONFIGS = {None: "sb3_dtfm.zoo_configs", "small": "sb3_dtfm.zoo_configs.small"}
 
 # Everything a trial changes inside `policy_kwargs`; RL-Zoo lets a trial's `policy_kwargs` replace the YAML's as a whole.
-_POLICY_KEYS = ("embed_dim", "n_layers", "n_heads", "dropout", "flow_hidden_dim", "flow_n_layers", "solver", "n_solver_steps")
+_POLICY_KEYS = ("embed_dim", "n_layers", "n_heads", "dropout", "flow_hidden_dim", "flow_n_layers", "n_solver_steps")
 
 
 def register() -> None:

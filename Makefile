@@ -1,0 +1,67 @@
+.DELETE_ON_ERROR:
+.PHONY: help install demo test format lint type clean
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/installed
+# What is checked and formatted besides the package.
+SOURCES := sb3_dtfm envs zoo_configs tests
+
+help:
+	@echo "make install  pinned environment in $(VENV), for Python 3.10 to 3.12"
+	@echo "make demo     record, train and evaluate on robosuite's Lift: at most 15 minutes on 2 cores"
+	@echo "make test     the fast tests"
+	@echo "make format   rewrite the sources in the project's format"
+	@echo "make lint     check format and style"
+	@echo "make type     check types"
+	@echo "make clean    remove $(VENV), builds and caches"
+
+install: $(STAMP)
+
+# A candidate has to run: an installed name may be a shim without a Python behind it. Plain python3 comes first, as the
+# interpreter that this machine is set up for.
+$(STAMP): pyproject.toml constraints.txt
+	@set -e; python=; \
+	for candidate in $(PYTHON) python3 python3.12 python3.11 python3.10 python; do \
+		if $$candidate -c 'import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 12))' \
+				>/dev/null 2>&1; then \
+			python=$$candidate; break; \
+		fi; \
+	done; \
+	if [ -z "$$python" ]; then \
+		echo "No Python 3.10, 3.11 or 3.12 with the venv module was found; 'make install PYTHON=/path/to/python' names one." >&2; \
+		exit 1; \
+	fi; \
+	echo "Installing into $(VENV) with $$($$python --version)"; \
+	rm -rf $(VENV); \
+	$$python -m venv $(VENV)
+	@$(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt -e ".[all,dev]" || { \
+		echo "The installation failed. robosuite needs evdev, which pip builds: that takes a C compiler, Python's headers" >&2; \
+		echo "(python3-dev) and the kernel's (linux-libc-dev)." >&2; \
+		exit 1; \
+	}
+	@touch $@
+
+demo: install
+	$(BIN)/sb3-dtfm demo
+
+test: install
+	$(BIN)/python -m pytest -n 2 --durations=10
+
+format: install
+	$(BIN)/ruff format $(SOURCES)
+	$(BIN)/ruff check --fix $(SOURCES)
+
+lint: install
+	$(BIN)/ruff format --check $(SOURCES)
+	$(BIN)/ruff check $(SOURCES)
+
+# mypy reads folders: it gets the package put together by links, as an installation would have it.
+type: install
+	@rm -rf build/typing && mkdir -p build/typing/sb3_dtfm
+	@ln -s $(CURDIR)/sb3_dtfm/* build/typing/sb3_dtfm/
+	@ln -s $(CURDIR)/envs $(CURDIR)/zoo_configs build/typing/sb3_dtfm/
+	cd build/typing && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -1,0 +1,142 @@
+"""robosuite itself: imported without its noise, its two scenes built, and the Lift scene's cube changed in place."""
+
+import logging
+import os
+import re
+import sys
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+TASKS = {"Lift": "Lift", "Can": "PickPlaceCan"}  # our names and robosuite's
+CONTROL_FREQUENCY = 20  # Hz
+
+CUBE_SIZE_RANGE = (0.020, 0.022)  # metres: half extents that robosuite draws its cube from whenever it builds the scene
+CUBE_DENSITY = 1000.0  # kg / m^3
+CUBE_VISUAL_MASS = 1e-8  # kg, of the cube's second geom, which is only drawn
+
+
+def import_robosuite() -> ModuleType:
+    """
+    robosuite, imported without its messages and without its choice of a rendering backend for the whole process.
+
+    :raises ImportError: not installed; says which extra installs it
+    """
+    if sys.modules.get("robosuite") is not None:
+        return sys.modules["robosuite"]
+    rendering_backend = os.environ.get("MUJOCO_GL")
+    try:
+        with _silence():
+            import robosuite
+    except ImportError as error:
+        raise ImportError(
+            f"The robosuite environments need robosuite, which cannot be imported ({error}): "
+            'pip install "sb3-dtfm[robosuite]"'
+        ) from error
+    finally:
+        if rendering_backend is None:
+            os.environ.pop("MUJOCO_GL", None)
+        else:
+            os.environ["MUJOCO_GL"] = rendering_backend
+    return robosuite
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Hold back robosuite's log messages below errors."""
+    logger = logging.getLogger("robosuite_logs")
+
+    def is_error(record: logging.LogRecord) -> bool:
+        return record.levelno >= logging.ERROR
+
+    logger.addFilter(is_error)
+    try:
+        yield
+    finally:
+        logger.removeFilter(is_error)
+
+
+def make_robosuite(task: str, controller_config: dict[str, Any] | None, lite_physics: bool) -> Any:
+    """
+    robosuite's own environment, without cameras, renderer and horizon.
+
+    :param task: "Lift" or "Can"
+    :param controller_config: of robosuite 1.5 or <= 1.4; robosuite's default for the Panda if not given
+    :param lite_physics: see :class:`~sb3_dtfm.envs.robosuite.RobosuiteEnv`
+    """
+    robosuite = import_robosuite()
+    from robosuite.controllers.composite.composite_controller_factory import refactor_composite_controller_config
+
+    with _silence():
+        if controller_config is not None:
+            controller_config = refactor_composite_controller_config(controller_config, "Panda", ["right"])
+        return robosuite.make(
+            TASKS[task],
+            robots="Panda",
+            controller_configs=controller_config,
+            control_freq=CONTROL_FREQUENCY,
+            lite_physics=lite_physics,
+            use_camera_obs=False,
+            has_renderer=False,
+            has_offscreen_renderer=False,
+            renderer="mujoco",  # none is opened; the default one would read a viewer's settings from disk
+            hard_reset=False,
+            ignore_done=True,
+            seed=0,
+        )
+
+
+def set_cube_size(env: Any, size: np.ndarray) -> None:
+    """
+    Give the cube of a compiled Lift scene another size, which costs a thousandth of compiling the scene anew.
+
+    :param env: robosuite's environment
+    :param size: (3,) half extents, metres
+    """
+    import mujoco
+
+    env.cube.size = [float(half) for half in size]
+    model, body = env.sim.model._model, env.cube_body_id
+    geoms = slice(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
+    model.geom_size[geoms] = size
+    model.geom_rbound[geoms] = np.linalg.norm(size)
+    model.geom_aabb[geoms, 3:] = size
+    model.bvh_aabb[model.body_bvhadr[body] :][: model.body_bvhnum[body], 3:] = size
+    mass = CUBE_DENSITY * 8.0 * np.prod(size) + CUBE_VISUAL_MASS
+    squares = np.square(size)
+    model.body_mass[body] = mass
+    model.body_inertia[body] = mass / 3.0 * (squares.sum() - squares)
+    mujoco.mj_setConst(model, env.sim.data._data)
+
+
+def scene_xml(env: Any) -> str:
+    """
+    MuJoCo XML of a scene with its present cube; asset paths start at robosuite's package, as robomimic expects.
+
+    :param env: robosuite's environment
+    """
+    package = os.path.dirname(import_robosuite().__file__ or "")
+    xml = re.sub(r'file="' + re.escape(package), 'file="robosuite', env.edit_model_xml(env.model.get_xml()))
+    if not hasattr(env, "cube"):
+        return xml
+    root = ET.fromstring(xml)
+    for geom in root.iter("geom"):
+        if geom.get("name", "").startswith("cube_g0"):
+            geom.set("size", " ".join(repr(half) for half in env.cube.size))
+    return ET.tostring(root, encoding="unicode")
+
+
+def cube_size(model_file: str) -> np.ndarray:
+    """
+    Half extents of the cube in a Lift scene, (3,) metres.
+
+    :param model_file: MuJoCo XML
+    """
+    for geom in ET.fromstring(model_file).iter("geom"):
+        if geom.get("name") == "cube_g0":
+            return np.array(geom.get("size", "").split(), np.float64)
+    raise ValueError("model_file holds no geom named 'cube_g0'; a robosuite Lift scene is expected.")

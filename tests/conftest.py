@@ -1,0 +1,53 @@
+"""Small real things that many tests share."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_dtfm.data import Trajectory, TrajectoryBuffer
+from sb3_dtfm.envs import ReturnToGoWrapper
+
+TINY_POLICY = dict(embed_dim=32, n_layers=2, n_heads=2)
+TINY_FLOW_POLICY = dict(TINY_POLICY, flow_hidden_dim=32, flow_n_layers=2, n_solver_steps=4)
+EPISODE_LENGTH = 30
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Tests share the cores with one another; threads that wait for each other would make them slow."""
+    th.set_num_threads(1)
+
+
+def make_env(seed: int | None = None) -> gym.Env:
+    """HalfCheetah in episodes of 30 steps, asking for a return of 5."""
+    env = ReturnToGoWrapper(gym.make("HalfCheetah-v5", max_episode_steps=EPISODE_LENGTH), target_return=5.0)
+    if seed is not None:
+        env.reset(seed=seed)
+    return env
+
+
+def record_random_episodes(n_episodes: int, seed: int = 0) -> list[Trajectory]:
+    """Episodes of HalfCheetah under random actions."""
+    env = gym.make("HalfCheetah-v5", max_episode_steps=EPISODE_LENGTH)
+    env.action_space.seed(seed)
+    trajectories = []
+    for episode in range(n_episodes):
+        observations, actions, rewards, truncated = [], [], [], False
+        observation, _ = env.reset(seed=seed + episode)
+        while not truncated:
+            action = env.action_space.sample()
+            observations.append(observation)
+            actions.append(action)
+            observation, reward, _, truncated, _ = env.step(action)
+            rewards.append(reward)
+        trajectories.append(
+            Trajectory(np.array(observations), np.array(actions), np.array(rewards), truncated=True, name=f"episode {episode}")
+        )
+    return trajectories
+
+
+@pytest.fixture(scope="session")
+def cheetah_buffer() -> TrajectoryBuffer:
+    space = gym.make("HalfCheetah-v5").action_space
+    return TrajectoryBuffer.from_trajectories(record_random_episodes(6), space, source="random cheetah")

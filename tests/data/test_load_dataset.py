@@ -1,0 +1,116 @@
+"""`load_dataset` finds the reader for whatever it is given, and says so when there is none."""
+
+import json
+import warnings
+from pathlib import Path
+from typing import Any
+
+import h5py
+import minari
+import numpy as np
+import pytest
+from gymnasium import spaces
+from minari.data_collector import EpisodeBuffer
+
+from sb3_dtfm.data import DatasetError, Trajectory, TrajectoryBuffer, load_dataset
+
+LIFT = {"robot0_eef_pos": 3, "robot0_eef_quat": 4, "robot0_gripper_qpos": 2, "object": 10}
+
+
+@pytest.fixture(autouse=True)
+def datasets_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+    return tmp_path
+
+
+@pytest.fixture
+def minari_dataset() -> minari.MinariDataset:
+    episode = EpisodeBuffer(
+        observations=np.zeros((5, 3)),
+        actions=np.zeros((4, 2), np.float32),
+        rewards=np.ones(4),
+        terminations=np.zeros(4, bool),
+        truncations=np.zeros(4, bool),
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return minari.create_dataset_from_buffers(
+            "test/ones-v0",
+            [episode],
+            observation_space=spaces.Box(-1.0, 1.0, (3,), np.float64),
+            action_space=spaces.Box(-1.0, 1.0, (2,), np.float32),
+        )
+
+
+@pytest.fixture
+def robomimic_file(tmp_path: Path) -> Path:
+    path = tmp_path / "lift.hdf5"
+    env_args = {"env_name": "Lift", "type": 1, "env_version": "1.5.1", "env_kwargs": {}}
+    with h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        data.attrs["total"] = 6
+        data.attrs["env_args"] = json.dumps(env_args)
+        for name in ("demo_0", "demo_1"):
+            demo = data.create_group(name)
+            demo.attrs["num_samples"] = 3
+            demo["actions"] = np.zeros((3, 7))
+            demo["rewards"] = demo["dones"] = np.array([0.0, 0.0, 1.0])
+            for key, size in LIFT.items():
+                demo[f"obs/{key}"] = np.zeros((3, size))
+        file["mask/train"] = np.array([b"demo_1"])
+    return path
+
+
+def test_a_minari_id_is_read(minari_dataset: minari.MinariDataset):
+    assert load_dataset("test/ones-v0").episode_returns.tolist() == [4.0]
+
+
+def test_an_opened_minari_dataset_is_read(minari_dataset: minari.MinariDataset):
+    assert load_dataset(minari_dataset).episode_returns.tolist() == [4.0]
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_a_robomimic_path_is_read(kind: type, robomimic_file: Path):
+    buffer = load_dataset(kind(robomimic_file))
+    assert buffer.episode_returns.tolist() == [1.0, 1.0]
+    assert buffer.observation_space.shape == (19,)
+
+
+def test_a_relative_path_is_read(robomimic_file: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(robomimic_file.parent)
+    assert load_dataset("lift.hdf5").n_episodes == 2
+
+
+def test_options_reach_the_reader(robomimic_file: Path):
+    buffer = load_dataset(robomimic_file, filter_key="train", observation_keys=["robot0_eef_pos"])
+    assert (buffer.n_episodes, buffer.observation_space.shape) == (1, (3,))
+
+
+def test_a_buffer_is_returned_as_it_is():
+    trajectory = Trajectory(np.zeros((2, 1)), np.zeros((2, 1)), np.zeros(2))
+    buffer = TrajectoryBuffer.from_trajectories([trajectory], spaces.Box(-1.0, 1.0, (1,)))
+    assert load_dataset(buffer) is buffer
+
+
+@pytest.mark.parametrize("name", ["missing.hdf5", "./missing", "~/missing.h5", "../data/missing.hdf5"])
+def test_a_missing_file_is_named(name: str):
+    with pytest.raises(DatasetError, match=f"{Path(name).name} does not exist"):
+        load_dataset(name)
+
+
+def test_a_folder_is_no_dataset(tmp_path: Path):
+    with pytest.raises(DatasetError, match="is a folder"):
+        load_dataset(tmp_path)
+
+
+@pytest.mark.parametrize("dataset", ["halfcheetah", "mujoco/halfcheetah/expert", "", 3, None, [1, 2], {"path": "x"}])
+def test_anything_else_is_refused_with_what_is_accepted(dataset: Any):
+    with pytest.raises(DatasetError, match="accepted are a Minari id"):
+        load_dataset(dataset)
+
+
+def test_an_unknown_option_is_refused_with_those_there_are(robomimic_file: Path, minari_dataset: minari.MinariDataset):
+    with pytest.raises(TypeError, match="unknown option filter; accepted: filter_key, observation_keys"):
+        load_dataset(robomimic_file, filter="train")
+    with pytest.raises(TypeError, match="test/ones-v0: unknown option filter_key; accepted: none"):
+        load_dataset("test/ones-v0", filter_key="train")

@@ -1,0 +1,196 @@
+"""The return-to-go wrapper: its spaces, its countdown, and that it agrees with recorded data to the bit."""
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env as gymnasium_check_env
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+from sb3_dtfm.data import load_minari
+from sb3_dtfm.data.record_agent import record_agent
+from sb3_dtfm.envs import ReturnToGoWrapper, flatten_observation_space, return_to_go_space
+
+
+class ConstantReward(gym.Env):
+    """Rewards 0.1 a step and shows what it is told to."""
+
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def __init__(self, observation_space: spaces.Space, observation: Any) -> None:
+        self.observation_space = observation_space
+        self.observation = observation
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Any, dict]:
+        super().reset(seed=seed)
+        return self.observation, {}
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict]:
+        return self.observation, 0.1, False, False, {}
+
+
+def constant_env() -> ConstantReward:
+    return ConstantReward(spaces.Box(-1.0, 1.0, (2,), np.float64), np.array([0.25, -0.5]))
+
+
+def test_observation_has_the_three_entries_with_their_types():
+    env = ReturnToGoWrapper(gym.make("HalfCheetah-v5"), 12_000)
+    observation, _ = env.reset(seed=0)
+    assert {key: (value.shape, value.dtype) for key, value in observation.items()} == {
+        "observation": ((17,), np.float32),
+        "return_to_go": ((1,), np.float32),
+        "timestep": ((1,), np.int64),
+    }
+    assert env.observation_space.contains(observation)
+    assert env.observation_space.contains(env.observation_space.sample())
+
+
+def test_return_to_go_falls_by_each_reward_in_float64():
+    env = ReturnToGoWrapper(constant_env(), 1.0)
+    observation, _ = env.reset()
+    expected = 1.0
+    for timestep in range(1000):
+        assert observation["return_to_go"][0] == np.float32(expected)
+        assert observation["timestep"][0] == timestep
+        observation, reward, *_ = env.step(np.zeros(1))
+        expected -= reward
+    observation, _ = env.reset()
+    assert (observation["return_to_go"][0], observation["timestep"][0]) == (1.0, 0)
+
+
+def test_a_new_target_takes_effect_at_the_next_reset():
+    env = ReturnToGoWrapper(constant_env(), 1.0)
+    env.reset()
+    env.set_target_return(5.0)
+    assert env.step(np.zeros(1))[0]["return_to_go"][0] == np.float32(0.9)
+    assert env.reset()[0]["return_to_go"][0] == 5.0
+
+
+def monitored_env() -> gym.Env:
+    return Monitor(ReturnToGoWrapper(gym.make("Pendulum-v1"), 1.0))
+
+
+@pytest.mark.parametrize("vec_env_class", [DummyVecEnv, SubprocVecEnv])
+def test_the_target_is_settable_through_a_vec_env(vec_env_class: type):
+    vec_env = vec_env_class([monitored_env, monitored_env])
+    vec_env.reset()
+    vec_env.env_method("set_target_return", 7.5, indices=[1])
+    assert vec_env.reset()["return_to_go"].tolist() == [[1.0], [7.5]]
+    vec_env.close()
+
+
+@pytest.mark.parametrize("target_return", [np.nan, np.inf, "100", None, True, [1.0, 2.0]])
+def test_a_target_that_is_no_finite_number_is_refused(target_return: Any):
+    with pytest.raises(ValueError, match="target_return must be a finite number"):
+        ReturnToGoWrapper(constant_env(), target_return)
+    env = ReturnToGoWrapper(constant_env(), np.float32(2.0))
+    with pytest.raises(ValueError, match="target_return must be a finite number"):
+        env.set_target_return(target_return)
+    assert env.reset()[0]["return_to_go"][0] == 2.0
+
+
+def test_the_checkers_of_gymnasium_and_sb3_pass_without_warnings():
+    # Bounds on observations that HalfCheetah itself does not have, and wrapping as such, are what gymnasium remarks on.
+    accepted = ("infinity", "is different from the unwrapped version")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        sb3_check_env(ReturnToGoWrapper(gym.make("HalfCheetah-v5"), 12_000))
+        gymnasium_check_env(ReturnToGoWrapper(gym.make("HalfCheetah-v5"), 12_000), skip_render_check=True)
+    messages = [str(warning.message) for warning in caught]
+    assert [message for message in messages if not any(part in message for part in accepted)] == []
+
+
+def test_a_wrapped_environment_is_made_again_from_its_spec():
+    env = gym.make(ReturnToGoWrapper(gym.make("Pendulum-v1"), -150.0).spec)
+    assert isinstance(env, ReturnToGoWrapper)
+    assert env.reset()[0]["return_to_go"][0] == -150.0
+
+
+@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "FetchReach-v4", "Pendulum-v1"])
+def test_a_dataset_and_its_environment_have_the_same_space(env_id: str):
+    env = gym.make(env_id)
+    from_dataset = return_to_go_space(flatten_observation_space(env.observation_space))
+    assert from_dataset == ReturnToGoWrapper(env, 0.0).observation_space
+
+
+def test_the_bounds_of_the_environment_are_kept():
+    space = flatten_observation_space(gym.make("Pendulum-v1").observation_space)
+    np.testing.assert_array_equal(space.high, [1.0, 1.0, 8.0])
+
+
+def test_goal_dict_is_flattened_as_gymnasium_does():
+    env = gym.make("FetchReach-v4")
+    expected, _ = gym.wrappers.FlattenObservation(gym.make("FetchReach-v4")).reset(seed=3)
+    observation, _ = ReturnToGoWrapper(env, 0.0).reset(seed=3)
+    np.testing.assert_array_equal(observation["observation"], expected.astype(np.float32))
+
+
+def test_dict_entries_come_in_sorted_order_however_the_space_was_built():
+    one, two = spaces.Box(-1.0, 1.0, (1,)), spaces.Box(-2.0, 2.0, (2,))
+    space = spaces.Dict(zebra=one, ant=spaces.Dict(y=two, x=spaces.Discrete(3)))
+    observation = {"zebra": np.ones(1, np.float32), "ant": {"y": np.array([2.0, -2.0], np.float32), "x": np.int64(1)}}
+    env = ReturnToGoWrapper(ConstantReward(space, observation), 0.0)
+    assert env.reset()[0]["observation"].tolist() == [0.0, 1.0, 0.0, 2.0, -2.0, 1.0]
+    assert env.observation_space["observation"].high.tolist() == [1.0, 1.0, 1.0, 2.0, 2.0, 1.0]
+
+
+def test_a_matrix_is_flattened():
+    matrix = np.arange(6, dtype=np.float64).reshape(2, 3)
+    env = ReturnToGoWrapper(ConstantReward(spaces.Box(0.0, 9.0, (2, 3), np.float64), matrix), 0.0)
+    assert env.reset()[0]["observation"].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        (spaces.Box(0, 255, (64, 64, 3), np.uint8), "holds an image"),
+        (spaces.Dict(camera=spaces.Box(0, 255, (64, 64), np.uint8)), "holds an image"),
+        (spaces.Text(5), "cannot be flattened"),
+        (spaces.Sequence(spaces.Discrete(3)), "cannot be flattened"),
+        (spaces.Dict(), "cannot be flattened"),
+    ],
+)
+def test_spaces_that_are_no_vector_are_refused(space: spaces.Space, message: str):
+    with pytest.raises(ValueError, match=message):
+        ReturnToGoWrapper(ConstantReward(space, None), 0.0)
+
+
+@pytest.mark.parametrize("env_id", ["HalfCheetah-v5", "Hopper-v5"])
+def test_replaying_a_recording_shows_exactly_the_return_to_go_of_the_buffer(
+    env_id: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    PPO("MlpPolicy", env_id, n_steps=8, batch_size=8, n_epochs=1, device="cpu").learn(8).save(tmp_path / "agent.zip")
+    dataset = record_agent(
+        "ppo",
+        tmp_path / "agent.zip",
+        env_id,
+        4,
+        "test/replay-v0",
+        deterministic=False,
+        n_envs=3,
+        progress=False,
+        env_kwargs={"max_episode_steps": 150},
+    )
+    buffer = load_minari(dataset)
+    episodes = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
+    env = ReturnToGoWrapper(gym.make(dataset.env_spec), 0.0)
+    row = 0
+    for index, length in enumerate(buffer.episode_lengths):
+        env.set_target_return(buffer.episode_returns[index])
+        observation, _ = env.reset(seed=episodes[index]["seed"])
+        for timestep in range(length):
+            assert observation["return_to_go"][0] == buffer.returns_to_go[row].item()
+            assert observation["timestep"][0] == buffer.timesteps[row].item() == timestep
+            np.testing.assert_array_equal(observation["observation"], buffer.observations[row].numpy())
+            observation, reward, terminated, truncated, _ = env.step(buffer.actions[row].numpy())
+            assert np.float32(reward) == buffer.rewards[row].item()
+            row += 1
+        assert (terminated, truncated) == (buffer.terminated[index], buffer.truncated[index])

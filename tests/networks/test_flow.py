@@ -1,0 +1,105 @@
+"""The flow's mathematics against closed forms."""
+
+import math
+
+import pytest
+import torch as th
+
+from sb3_dtfm.networks.flow import SOLVERS, VectorField, check_solver, integrate, interpolate, sinusoidal_embedding
+from sb3_dtfm.networks.heads import FlowHead
+
+ORDERS = {"euler": 1, "midpoint": 2, "heun": 2, "rk4": 4}
+
+
+def nonlinear_field(x: th.Tensor, tau: float) -> th.Tensor:
+    """dx/dtau = x^2 exp(-tau), whose flow is x(1) = 1 / (1 / x(0) - 1 + 1 / e)."""
+    return x.square() * math.exp(-tau)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_solver_converges_to_the_closed_form_at_its_order(solver):
+    noise = th.tensor([[0.5, -1.0, 0.9]], dtype=th.float64)
+    exact = 1.0 / (1.0 / noise - 1.0 + math.exp(-1.0))
+    errors = [(integrate(nonlinear_field, noise, solver, n) - exact).abs().max().item() for n in (16, 32, 64)]
+    for coarse, fine in zip(errors, errors[1:]):
+        assert math.log2(coarse / fine) == pytest.approx(ORDERS[solver], abs=0.15)
+    assert errors[-1] < 0.05
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_every_solver_is_exact_on_a_straight_path_in_one_step(solver):
+    noise, action = th.randn(5, 3), th.rand(5, 3)
+    torch_path = integrate(lambda x, tau: action - noise, noise, solver, 1)
+    assert th.allclose(torch_path, action, atol=1e-6)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_gaussian_flow_carries_noise_to_the_target_distribution(solver):
+    """For a Gaussian target the marginal vector field of conditional flow matching is known, and so is its flow."""
+    mean, std = 0.3, 0.2
+
+    def marginal_field(x: th.Tensor, tau: float) -> th.Tensor:
+        variance = (1 - tau) ** 2 + (tau * std) ** 2
+        slope = (tau * std**2 - (1 - tau)) / variance
+        return mean + slope * (x - tau * mean)
+
+    noise = th.randn(20, 2, dtype=th.float64, generator=th.Generator().manual_seed(0))
+    assert th.allclose(integrate(marginal_field, noise, solver, 400), mean + std * noise, atol=6e-3)
+
+
+def test_interpolate_runs_from_noise_at_zero_to_action_at_one():
+    noise, action = th.randn(4, 3), th.randn(4, 3)
+    for tau, expected in ((0.0, noise), (1.0, action), (0.25, 0.75 * noise + 0.25 * action)):
+        x, velocity = interpolate(noise, action, th.full((4, 1), tau))
+        assert th.allclose(x, expected, atol=1e-6)
+        assert th.allclose(velocity, action - noise)
+
+
+def test_velocity_agrees_with_the_papers_form_away_from_its_singularity():
+    noise, action, tau = th.randn(4, 3), th.randn(4, 3), th.full((4, 1), 0.7)
+    x, velocity = interpolate(noise, action, tau)
+    assert th.allclose(velocity, (action - x) / (1 - tau), atol=1e-5)
+
+
+def test_sinusoidal_embedding_tells_neighbouring_times_apart():
+    embedding = sinusoidal_embedding(th.linspace(0, 1, 101), 64)
+    assert embedding.shape == (101, 64)
+    distances = th.cdist(embedding, embedding) + 1e9 * th.eye(101)
+    assert distances.min() > 0.1
+
+
+def test_film_halves_add_up_to_one_linear_map_of_time_and_condition():
+    field = VectorField(action_dim=3, condition_dim=8, hidden_dim=16, n_layers=2)
+    hidden, tau = th.randn(5, 8), th.rand(5)
+    weight = th.cat((field.film_time.weight, field.film_condition.weight), dim=1)
+    features = th.cat((sinusoidal_embedding(tau, field.time_embedding_dim), hidden), dim=1)
+    joint = features @ weight.T + field.film_condition.bias
+    x = noise = th.randn(5, 3)
+    for i, layer in enumerate(field.layers):
+        scale, shift = joint[:, 32 * i : 32 * i + 16], joint[:, 32 * i + 16 : 32 * i + 32]
+        x = th.nn.functional.silu(layer(x) * (1 + scale) + shift)
+    assert th.allclose(field(noise, tau, field.condition(hidden)), field.output(x), atol=1e-5)
+
+
+def test_a_flow_head_learns_two_modes_that_regression_would_average():
+    th.manual_seed(0)
+    generator = th.Generator().manual_seed(0)
+    head = FlowHead(embed_dim=4, action_dim=1, hidden_dim=64, n_layers=2, n_solver_steps=20)
+    optimizer = th.optim.Adam(head.parameters(), 3e-3)
+    hidden, mask = th.zeros(256, 1, 4), th.ones(256, 1, dtype=th.bool)
+    for _ in range(400):
+        actions = th.where(th.rand(256, 1, 1, generator=generator) < 0.5, -0.7, 0.7)
+        noise, tau = th.randn(256, 1, 1, generator=generator), th.rand(256, 1, generator=generator)
+        optimizer.zero_grad()
+        head.loss(hidden, actions, mask, noise, tau).backward()
+        optimizer.step()
+    with th.no_grad():
+        samples = head(th.zeros(500, 4), th.randn(500, 1, generator=generator))
+    assert ((samples.abs() - 0.7).abs() < 0.2).float().mean() > 0.9
+    assert 0.35 < (samples > 0).float().mean() < 0.65
+
+
+@pytest.mark.parametrize(("solver", "n_solver_steps"), [("verlet", 10), ("euler", 0)])
+def test_unknown_solvers_are_refused_by_name(solver, n_solver_steps):
+    with pytest.raises(ValueError, match="verlet" if solver == "verlet" else "n_solver_steps"):
+        check_solver(solver, n_solver_steps)

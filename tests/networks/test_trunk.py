@@ -1,0 +1,94 @@
+"""What the trunk may see, and that padding changes nothing."""
+
+import pytest
+import torch as th
+
+from sb3_dtfm.networks.heads import RegressionHead, masked_mean
+from sb3_dtfm.networks.trunk import SequenceTrunk, causal_mask
+
+B, K, O, A = 3, 6, 5, 2
+
+
+@pytest.fixture
+def trunk() -> SequenceTrunk:
+    th.manual_seed(0)
+    return SequenceTrunk(O, A, max_timestep=50, embed_dim=16, n_layers=2, n_heads=2, dropout=0.0)
+
+
+@pytest.fixture
+def window() -> dict[str, th.Tensor]:
+    generator = th.Generator().manual_seed(1)
+    return dict(
+        observations=th.randn(B, K, O, generator=generator),
+        actions=th.rand(B, K, A, generator=generator),
+        returns_to_go=th.randn(B, K, generator=generator),
+        timesteps=th.arange(K).repeat(B, 1),
+        mask=th.ones(B, K, dtype=th.bool),
+    )
+
+
+def changed_steps(trunk, window, name, step):
+    """Steps whose hidden state changes with the given input."""
+    before = trunk(**window)
+    moved = {key: value.clone() for key, value in window.items()}
+    moved[name][:, step] += 1
+    return [k for k in range(K) if not th.allclose(before[:, k], trunk(**moved)[:, k], atol=1e-6)]
+
+
+@pytest.mark.parametrize("name", ["observations", "returns_to_go", "timesteps"])
+def test_a_hidden_state_sees_its_own_step_and_everything_before(trunk, window, name):
+    assert changed_steps(trunk, window, name, 2) == [2, 3, 4, 5]
+
+
+def test_an_action_is_seen_from_the_next_step_on(trunk, window):
+    assert changed_steps(trunk, window, "actions", 2) == [3, 4, 5]
+    assert changed_steps(trunk, window, "actions", K - 1) == []
+
+
+def test_padding_on_the_left_changes_no_hidden_state(trunk, window):
+    short = {key: value[:, -4:] for key, value in window.items()}
+    padded = {key: value.clone() for key, value in window.items()}
+    for key, value in padded.items():
+        value[:, :2] = False if key == "mask" else 7
+    assert th.allclose(trunk(**padded)[:, -4:], trunk(**short), atol=1e-6)
+
+
+def test_a_fully_padded_row_stays_finite(trunk, window):
+    window["mask"] = window["mask"].clone()
+    window["mask"][0, :-1] = False
+    hidden = trunk(**window)
+    hidden.sum().backward()
+    assert hidden.isfinite().all()
+    assert all(parameter.grad is None or parameter.grad.isfinite().all() for parameter in trunk.parameters())
+
+
+def test_causal_mask_by_hand():
+    allowed = causal_mask(th.tensor([[False, True, True]]))[0, 0]
+    assert allowed.tolist() == [[True, False, False], [False, True, False], [False, True, True]]
+
+
+def test_time_steps_beyond_the_longest_share_the_last_embedding(trunk, window):
+    late, later = dict(window), dict(window)
+    late["timesteps"] = th.full_like(window["timesteps"], 49)
+    later["timesteps"] = th.full_like(window["timesteps"], 4000)
+    assert th.equal(trunk(**late), trunk(**later))
+
+
+def test_every_parameter_gets_a_gradient(trunk, window):
+    trunk(**window).square().sum().backward()
+    assert [name for name, parameter in trunk.named_parameters() if parameter.grad is None] == []
+
+
+def test_masked_mean_divides_by_valid_steps():
+    values = th.tensor([[[1.0, 3.0], [5.0, 5.0]], [[100.0, 100.0], [0.0, 2.0]]])
+    mask = th.tensor([[True, True], [False, True]])
+    assert masked_mean(values, mask).item() == pytest.approx((2 + 5 + 1) / 3)
+
+
+def test_regression_actions_stay_within_their_bounds():
+    assert RegressionHead(4, 2)(1e3 * th.randn(10, 4)).abs().max() <= 1.0
+
+
+def test_width_must_be_a_multiple_of_the_heads():
+    with pytest.raises(ValueError, match="embed_dim=30 and n_heads=4"):
+        SequenceTrunk(O, A, 10, embed_dim=30, n_heads=4)

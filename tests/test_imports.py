@@ -1,0 +1,65 @@
+"""Who may import whom: read from the sources, so that no import has to happen."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = "sb3_dtfm"
+
+# Room: its files, and the parts of the package that it may import.
+ROOMS = {
+    "networks": ("sb3_dtfm/networks", {"networks"}),
+    "context": ("sb3_dtfm/context.py", set()),
+    "envs": ("envs", {"envs"}),
+    "data": ("sb3_dtfm/data", {"data", "envs"}),
+    "policies": ("sb3_dtfm/policies.py", {"networks", "context"}),
+    "callbacks": ("sb3_dtfm/callbacks.py", {"data"}),
+    "algorithms": ("sb3_dtfm/algorithms.py", {"policies", "data", "envs", "callbacks"}),
+    "zoo": ("sb3_dtfm/zoo", {"", "data", "envs", "zoo"}),
+}
+
+
+def files(room: str) -> list[Path]:
+    path = ROOT / ROOMS[room][0]
+    found = sorted(path.rglob("*.py")) if path.is_dir() else [path]
+    assert found
+    return found
+
+
+def imported_modules(path: Path) -> list[str]:
+    """Full names of all modules that a file imports, wherever in the file."""
+    modules = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            modules += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            package_only = node.module == PACKAGE
+            rooms = {name for name in ROOMS if name != ""}
+            modules += [
+                f"{PACKAGE}.{alias.name}" if package_only and alias.name in rooms else str(node.module) for alias in node.names
+            ]
+    return modules
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_room_imports_only_the_rooms_below_it(room):
+    for path in files(room):
+        own = {module for module in imported_modules(path) if module.split(".")[0] == PACKAGE}
+        rooms = {module.split(".")[1] if "." in module else "" for module in own}
+        assert rooms <= ROOMS[room][1], f"{path.relative_to(ROOT)} imports {sorted(own)}"
+
+
+def test_networks_need_torch_alone():
+    standard = {"collections", "dataclasses", "math", "typing", "__future__", "abc", "functools"}
+    for path in files("networks"):
+        roots = {module.split(".")[0] for module in imported_modules(path)}
+        assert roots <= standard | {"torch", PACKAGE}, path
+
+
+def test_every_module_belongs_to_a_room():
+    known = {path for room in ROOMS for path in files(room)} | {ROOT / "sb3_dtfm" / name for name in ("__init__.py", "__main__.py")}
+    benchmark = set((ROOT / "sb3_dtfm" / "benchmark").rglob("*.py"))
+    assert {path for path in (ROOT / "sb3_dtfm").rglob("*.py")} - benchmark <= known

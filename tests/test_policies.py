@@ -1,0 +1,178 @@
+"""`predict`: full context in every way of calling it, repeatable, and safe against the wrong input."""
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_dtfm import DT, DTFM
+from sb3_dtfm.policies import DTFMPolicy
+from tests.conftest import TINY_FLOW_POLICY, TINY_POLICY, make_env
+
+ALGORITHMS = [(DT, TINY_POLICY), (DTFM, TINY_FLOW_POLICY)]
+
+
+@pytest.fixture(params=ALGORITHMS, ids=["dt", "dtfm"])
+def model(request, cheetah_buffer):
+    algorithm, policy_kwargs = request.param
+    return algorithm(
+        "MultiInputPolicy", dataset=cheetah_buffer, context_length=5, policy_kwargs=policy_kwargs, batch_size=16, seed=0
+    ).learn(20)
+
+
+def roll_plain(model, n_steps, seed=0):
+    env = make_env()
+    observation, _ = env.reset(seed=seed)
+    actions = []
+    for _ in range(n_steps):
+        action, _ = model.predict(observation, deterministic=True)
+        observation, _, _, truncated, _ = env.step(action)
+        actions.append(action)
+        if truncated:
+            observation, _ = env.reset(seed=seed + 1)
+    return np.array(actions)
+
+
+def roll_with_state(model, n_steps, seed=0):
+    env = make_env()
+    observation, _ = env.reset(seed=seed)
+    actions, state, episode_start = [], None, np.array([True])
+    for _ in range(n_steps):
+        action, state = model.predict(observation, state=state, episode_start=episode_start, deterministic=True)
+        observation, _, _, truncated, _ = env.step(action)
+        actions.append(action)
+        episode_start = np.array([truncated])
+        if truncated:
+            observation, _ = env.reset(seed=seed + 1)
+    return np.array(actions)
+
+
+def test_a_plain_loop_and_explicit_state_give_the_same_actions_to_the_bit(model):
+    assert np.array_equal(roll_plain(model, 45), roll_with_state(model, 45))
+
+
+def test_deterministic_actions_repeat_to_the_bit(model):
+    assert np.array_equal(roll_plain(model, 12), roll_plain(model, 12))
+
+
+def test_the_past_matters(model):
+    """The same observation after different pasts gives different actions: the context is really used."""
+    env = make_env()
+    observation, _ = env.reset(seed=0)
+    with_past, state = model.predict(observation, deterministic=True)
+    following = {**observation, "timestep": np.array([1])}
+    with_past, _ = model.predict(following, state=state, episode_start=np.array([False]), deterministic=True)
+    alone, _ = model.predict(following, state=state, episode_start=np.array([True]), deterministic=True)
+    assert not np.allclose(with_past, alone)
+
+
+def test_predict_with_state_is_a_pure_function(model):
+    observation, _ = make_env().reset(seed=0)
+    _, state = model.predict(observation, deterministic=True)
+    copies = [array.copy() for array in state]
+    following = {**observation, "timestep": np.array([1])}
+    first, _ = model.predict(following, state=state, deterministic=True)
+    model.predict({**observation, "observation": observation["observation"] + 1}, deterministic=True)
+    second, _ = model.predict(following, state=state, deterministic=True)
+    assert np.array_equal(first, second)
+    assert all(np.array_equal(array, copy) for array, copy in zip(state, copies))
+
+
+def test_parallel_environments_act_as_they_would_alone(model):
+    """Rows do not see each other, also when one is reset in between."""
+    vec_env = DummyVecEnv([make_env, make_env])
+    vec_env.seed(3)
+    observations = vec_env.reset()
+    rows, alone_actions, together_actions = [None, None], [], []
+    state, starts = None, np.ones(2, bool)
+    for t in range(12):
+        if t == 7:
+            observations["timestep"][1] = 0
+            starts = np.array([False, True])
+        together, state = model.predict(observations, state=state, episode_start=starts, deterministic=True)
+        alone = []
+        for row in range(2):
+            single = {key: value[row] for key, value in observations.items()}
+            action, rows[row] = model.predict(single, rows[row], starts[row : row + 1], deterministic=True)
+            alone.append(action)
+        together_actions.append(together)
+        alone_actions.append(alone)
+        starts = np.zeros(2, bool)
+        timesteps = observations["timestep"] + 1
+        observations, _, _, _ = vec_env.step(together)
+        observations["timestep"] = timesteps
+    assert np.allclose(together_actions, alone_actions, atol=1e-5)
+
+
+def test_actions_lie_in_the_environments_range_with_its_shape(model):
+    observation, _ = make_env().reset(seed=0)
+    action, _ = model.predict(observation)
+    assert action.shape == (6,) and model.action_space.contains(action)
+    batch = {key: np.stack([value] * 3) for key, value in observation.items()}
+    actions, state = model.predict(batch)
+    assert actions.shape == (3, 6)
+    assert all(len(array) == 3 for array in state)
+
+
+def test_fresh_noise_differs_and_deterministic_noise_is_not_zero(cheetah_buffer):
+    model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=TINY_FLOW_POLICY, seed=0)
+    observation, _ = make_env().reset(seed=0)
+    drawn = [model.predict(observation, deterministic=False)[0] for _ in range(2)]
+    assert not np.allclose(*drawn)
+    timesteps = th.tensor([0, 1, 7])
+    noise = model.policy._acting_noise(timesteps, deterministic=True)
+    assert noise.abs().min() > 0 and not th.allclose(noise[0], noise[1])
+    assert th.equal(noise, model.policy._acting_noise(timesteps, deterministic=True))
+
+
+def test_normalisation_is_the_datasets(model, cheetah_buffer):
+    observations = cheetah_buffer.observations.numpy()
+    assert np.allclose(model.policy.observation_mean, observations.mean(0), atol=1e-4)
+    assert np.allclose(model.policy.observation_std, observations.std(0), rtol=1e-3)
+    assert model.policy.return_scale == cheetah_buffer.returns_to_go.abs().max()
+
+
+def test_weight_decay_spares_biases_norms_and_embeddings(model):
+    decayed, spared = model.policy.optimizer.param_groups
+    assert decayed["weight_decay"] == 1e-3 and spared["weight_decay"] == 0.0
+    names = {id(parameter): name for name, parameter in model.policy.network.named_parameters()}
+    assert all("weight" in names[id(p)] and "norm" not in names[id(p)] for p in decayed["params"])
+    assert all("bias" in names[id(p)] or "norm" in names[id(p)] or "timestep" in names[id(p)] for p in spared["params"])
+    assert len(decayed["params"]) + len(spared["params"]) == len(names)
+
+
+def test_a_policy_saves_and_loads_alone(model, tmp_path):
+    model.policy.save(str(tmp_path / "policy.pt"))
+    loaded = type(model.policy).load(str(tmp_path / "policy.pt"))
+    assert np.array_equal(roll_plain(loaded, 8), roll_plain(model, 8))
+
+
+def test_solver_can_be_changed_after_training(cheetah_buffer):
+    model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=TINY_FLOW_POLICY, seed=0, ema_decay=0.9)
+    assert isinstance(model.policy, DTFMPolicy)
+    observation, _ = make_env().reset(seed=0)
+    coarse, _ = model.predict(observation, deterministic=True)
+    model.policy.set_solver("rk4", 100)
+    fine, _ = model.predict(observation, deterministic=True)
+    model.policy.set_solver("heun", 400)
+    finest, _ = model.predict(observation, deterministic=True)
+    assert not np.array_equal(coarse, fine)
+    assert np.allclose(fine, finest, atol=1e-3)
+    with pytest.raises(ValueError, match="solver must be one of"):
+        model.policy.set_solver("leapfrog", 3)
+
+
+def test_an_observation_without_return_to_go_is_refused(model):
+    with pytest.raises(ValueError, match="ReturnToGoWrapper"):
+        model.predict(np.zeros(17, np.float32))
+    observation, _ = make_env().reset(seed=0)
+    with pytest.raises(ValueError, match=r"\(16,\).*\(17,\)"):
+        model.predict({**observation, "observation": observation["observation"][:16]})
+
+
+def test_a_state_of_other_environments_is_refused(model):
+    observation, _ = make_env().reset(seed=0)
+    _, state = model.predict(observation)
+    batch = {key: np.stack([value] * 3) for key, value in observation.items()}
+    with pytest.raises(ValueError, match="1 environments, the observation to 3"):
+        model.predict(batch, state=state)

@@ -1,0 +1,60 @@
+"""What the command line makes of its arguments before RL-Zoo sees them."""
+
+import argparse
+
+import pytest
+from rl_zoo3.utils import StoreDict
+
+from sb3_dtfm.zoo.arguments import UsageError, enjoy_arguments, train_arguments
+from sb3_dtfm.zoo.registration import packaged_config
+
+
+def zoo_reads(arguments: list[str]) -> argparse.Namespace:
+    """The relevant part of RL-Zoo's parser."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--algo")
+    parser.add_argument("-conf", "--conf-file")
+    parser.add_argument("-params", "--hyperparams", nargs="+", action=StoreDict)
+    parser.add_argument("-n", type=int)
+    parser.add_argument("--env-kwargs", nargs="+", action=StoreDict)
+    return parser.parse_args(arguments)
+
+
+@pytest.mark.parametrize("algo", ["dt", "dtfm"])
+def test_conf_file_defaults_to_the_paper_and_small_is_packaged(algo):
+    assert zoo_reads(train_arguments(["--algo", algo])).conf_file == str(packaged_config(algo))
+    assert zoo_reads(train_arguments(["--algo", algo, "-conf", "small"])).conf_file == str(packaged_config(algo, "small"))
+    assert packaged_config(algo).parent.name == "zoo_configs"
+    assert packaged_config(algo, "small").parent.name == "small"
+
+
+def test_any_other_conf_file_stays():
+    assert zoo_reads(train_arguments(["--algo", "dtfm", "--conf-file=mine.yml"])).conf_file == "mine.yml"
+    assert zoo_reads(train_arguments(["--algo", "sac"])).conf_file is None
+    assert zoo_reads(train_arguments(["--algo", "sac", "--conf-file", "small"])).conf_file == "small"
+
+
+def test_shorthands_join_the_users_hyperparameters():
+    arguments = ["--algo", "dt", "--dataset", "it's a/file:1.hdf5", "-params", "batch_size:8", "-n", "5"]
+    arguments += ["--dataset-fraction", "0.5", "--target-return", "3000", "--env-kwargs", "a:1", "--hyperparams", "seed:3"]
+    read = zoo_reads(train_arguments(arguments))
+    assert read.hyperparams == {
+        "batch_size": 8,
+        "seed": 3,
+        "dataset": "it's a/file:1.hdf5",
+        "dataset_fraction": 0.5,
+        "env_wrapper": [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 3000.0}}],
+    }
+    assert read.n == 5
+    assert read.env_kwargs == {"a": 1}
+
+
+def test_a_dataset_for_an_online_algorithm_is_refused():
+    with pytest.raises(UsageError, match="--dataset: for --algo dt and dtfm only, not for sac"):
+        train_arguments(["--algo", "sac", "--dataset", "x"])
+
+
+def test_enjoy_looks_where_train_writes():
+    assert enjoy_arguments(["--algo", "dtfm", "--env", "E"])[-2:] == ["--folder", "logs"]
+    assert enjoy_arguments(["--algo", "dtfm", "-f", "mine"]) == ["--algo", "dtfm", "-f", "mine"]
+    assert enjoy_arguments(["--algo", "sac"]) == ["--algo", "sac"]

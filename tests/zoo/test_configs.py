@@ -1,0 +1,76 @@
+"""The packaged hyperparameters: every task's model can be built, and DT and DTFM differ in the head only."""
+
+import copy
+
+import gymnasium as gym
+import pytest
+import yaml
+from rl_zoo3.utils import get_wrapper_class
+
+from sb3_dtfm.zoo.registration import OFFLINE_ALGORITHMS, packaged_config
+
+TARGETS = {
+    "HalfCheetah-v5": 20000,
+    "Walker2d-v5": 10000,
+    "Ant-v5": 10000,
+    "Humanoid-v5": 12000,
+    "robosuite/Lift-v0": 1,
+    "robosuite/Can-v0": 1,
+}
+HEAD_KEYS = {"flow_hidden_dim", "flow_n_layers", "solver", "n_solver_steps"}
+SETTINGS = [None, "small"]
+
+
+def load(algo: str, settings: str | None) -> dict:
+    return yaml.safe_load(packaged_config(algo, settings).read_text())
+
+
+@pytest.mark.parametrize("settings", SETTINGS)
+@pytest.mark.parametrize("env_id", TARGETS)
+def test_every_task_builds_its_model(env_id, settings):
+    env = gym.make(env_id)
+    for algo, algorithm in OFFLINE_ALGORITHMS.items():
+        hyperparams = load(algo, settings)[env_id]
+        wrapped = get_wrapper_class(hyperparams)(env)
+        assert wrapped.get_wrapper_attr("target_return") == TARGETS[env_id]
+        assert hyperparams.pop("n_timesteps") >= 2500
+        assert isinstance(hyperparams.pop("dataset"), str)
+        del hyperparams["env_wrapper"]
+        model = algorithm(env=wrapped, device="cpu", **hyperparams)
+        assert isinstance(model.learning_rate, float)
+        assert model.batch_size == hyperparams["batch_size"]
+    env.close()
+
+
+@pytest.mark.parametrize("settings", SETTINGS)
+def test_dt_and_dtfm_differ_in_the_head_only(settings):
+    dt, dtfm = load("dt", settings), copy.deepcopy(load("dtfm", settings))
+    assert set(dt) == {"default", *TARGETS}
+    for hyperparams in dtfm.values():
+        for key in HEAD_KEYS & set(hyperparams["policy_kwargs"]):
+            del hyperparams["policy_kwargs"][key]
+    assert dt == dtfm
+
+
+def test_the_papers_settings():
+    default = load("dtfm", None)["default"]
+    assert default["policy_kwargs"] == {
+        "embed_dim": 256,
+        "n_layers": 10,
+        "n_heads": 2,
+        "dropout": 0.1,
+        "flow_hidden_dim": 512,
+        "flow_n_layers": 3,
+        "solver": "euler",
+        "n_solver_steps": 50,
+    }
+    del default["policy_kwargs"]
+    assert default == {
+        "policy": "MultiInputPolicy",
+        "n_timesteps": 150000,
+        "context_length": 20,
+        "batch_size": 256,
+        "learning_rate": 1e-4,
+        "learning_rate_schedule": "constant",
+        "weight_decay": 1e-3,
+    }
