@@ -8,7 +8,10 @@ import numpy as np
 METRES_PER_SECOND = 0.306
 RADIANS_PER_SECOND = 3.06
 
+TURN_SHARE = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])  # of the unsteadiness, per action dimension
+
 OPEN, CLOSE = -1.0, 1.0
+OVERREACH = 0.012  # metres below the grasp point that the descent aims at, so that the hand does not creep the last bit
 FINGERS_STILL = 4e-4  # metres per step
 DOWNWARD = np.array([1.0, 0.0, 0.0, 0.0])  # hand pointing down, as x y z w
 CAN_BIN_CENTRE = np.array([0.1975, 0.405])  # metres: the compartment of the target bin that is the can's
@@ -36,6 +39,7 @@ class Manner:
     :param release_tolerance: distance from that place at which the fingers open, metres
     :param noise: standard deviation of the unsteadiness of the hand, action units
     :param noise_memory: its correlation from step to step
+    :param jerk_rate: how often the hand is jerked aside, per step
     """
 
     speed: float
@@ -53,6 +57,7 @@ class Manner:
     release_tolerance: float
     noise: float
     noise_memory: float
+    jerk_rate: float
 
     @classmethod
     def draw(cls, rng: np.random.Generator, speed_range: tuple[float, float]) -> "Manner":
@@ -78,6 +83,7 @@ class Manner:
             release_tolerance=rng.uniform(0.025, 0.045),
             noise=rng.uniform(0.05, 0.13),
             noise_memory=rng.uniform(0.7, 0.9),
+            jerk_rate=rng.uniform(0.0, 0.06),
         )
 
 
@@ -94,6 +100,7 @@ class Demonstrator:
     smallest_grip = 0.012  # metres from the middle to a finger: closed further, it holds nothing
     grasp_height = 0.0  # metres above the object's centre
     speed_range = (0.55, 0.95)
+    free_stages = ("hover", "descend")  # where a jerk does no harm
 
     def __init__(self, seed: int | np.random.SeedSequence | None = None) -> None:
         self._rng = np.random.default_rng(seed)
@@ -106,6 +113,8 @@ class Demonstrator:
         self._steps_in_stage = 0
         self._movement = np.zeros(6)
         self._unsteadiness = np.zeros(6)
+        self._jerk = np.zeros(6)
+        self._jerk_steps = 0
         self._fingers = 0.0
 
     def act(self, observation: np.ndarray) -> np.ndarray:
@@ -134,7 +143,7 @@ class Demonstrator:
         if self.stage == "descend":
             if aside > 0.04:
                 return "hover"
-            if np.linalg.norm(to_grasp) < manner.grasp_tolerance and fingers > 0.03:
+            if aside < manner.grasp_tolerance and -to_grasp[2] < manner.grasp_tolerance and fingers > 0.03:
                 return "grasp"
         if self.stage == "grasp" and self._steps_in_stage >= 3 + manner.dwell and finger_speed < FINGERS_STILL:
             return self._after_grasp() if fingers > self.smallest_grip else "hover"
@@ -151,7 +160,7 @@ class Demonstrator:
             height = self.manner.hover_height + 0.5 * aside
             return grasp_point + np.array([*self.manner.hover_offset, height]), OPEN
         if self.stage == "descend":
-            return grasp_point, OPEN
+            return grasp_point - np.array([0.0, 0.0, OVERREACH]), OPEN
         if self.stage == "grasp":
             return grasp_point, CLOSE
         return self._target_holding(hand, position)
@@ -180,15 +189,33 @@ class Demonstrator:
         wanted = np.empty(6)
         wanted[:3] = offset / (METRES_PER_SECOND * manner.time_constant)
         wanted[:3] *= min(1.0, manner.speed / max(float(np.linalg.norm(wanted[:3])), 1e-9))
-        wanted[3:] = np.clip(rotation / (RADIANS_PER_SECOND * 2.0 * manner.time_constant), -0.1, 0.1)
+        wanted[3:] = np.clip(rotation / (RADIANS_PER_SECOND * 1.5 * manner.time_constant), -0.2, 0.2)
         self._movement += np.clip(wanted - self._movement, -manner.agility, manner.agility)
-        fresh = np.sqrt(1.0 - manner.noise_memory**2) * self._rng.normal(size=6)
-        self._unsteadiness = manner.noise_memory * self._unsteadiness + fresh
         # A hand in motion shakes more than one that aims, and turns less than it shifts.
         effort = 0.3 + 0.7 * float(np.linalg.norm(self._movement[:3])) / manner.speed
-        noise = manner.noise * effort * np.array([1.0, 1.0, 1.0, 0.2, 0.2, 0.2]) * self._unsteadiness
+        fresh = np.sqrt(1.0 - manner.noise_memory**2) * self._rng.normal(size=6)
+        self._unsteadiness = manner.noise_memory * self._unsteadiness + fresh
+        noise = manner.noise * effort * TURN_SHARE * self._unsteadiness + self._next_jerk()
         action = np.append(self._movement + noise, gripper)
         return np.clip(action, -1.0, 1.0).astype(np.float32)
+
+
+    def _next_jerk(self) -> np.ndarray:
+        """
+        A short push in a random direction now and then, which the steps after it correct.
+
+        Unlike steady noise it leads far from the straight way and leaves most of the recorded actions clean.
+        """
+        if self._jerk_steps > 0:
+            self._jerk_steps -= 1
+            return self._jerk
+        if self.stage in self.free_stages and self._rng.random() < self.manner.jerk_rate:
+            direction = self._rng.normal(size=6)
+            direction /= np.linalg.norm(direction[:3])
+            self._jerk = self._rng.uniform(0.3, 1.0) * np.array([1.0, 1.0, 1.0, 0.4, 0.4, 0.4]) * direction
+            self._jerk_steps = int(self._rng.integers(1, 4))
+            return self._jerk
+        return np.zeros(6)
 
 
 class LiftDemonstrator(Demonstrator):

@@ -1,7 +1,7 @@
 """robosuite's Lift and Can tasks as Gymnasium environments, with robomimic's low-dimensional observation."""
 
 import json
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -87,7 +87,7 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
     :param height: of `rgb_array` frames, pixels
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": CONTROL_FREQUENCY}
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": CONTROL_FREQUENCY}  # noqa: RUF012
 
     def __init__(
         self,
@@ -118,7 +118,8 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
         self._viewer: Any = None
         self._find_references()
         low, high = self._env.action_spec
-        self.action_space = spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+        self._low, self._high = low.astype(np.float32), high.astype(np.float32)
+        self.action_space = spaces.Box(self._low, self._high, dtype=np.float32)
         self._start_from(self.state)
         self.observation_space = spaces.Box(-np.inf, np.inf, self._observation().shape, np.float32)
 
@@ -191,9 +192,9 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
         """
         # Through float32 always: a recorded action, stored in whichever precision, then replays to the bit.
         command = np.asarray(action, np.float32).astype(np.float64)
-        if command.shape != self.action_space.shape or not np.isfinite(command).all():
-            raise ValueError(f"action must be {self.action_space.shape} finite numbers, got {action!r}.")
-        self._advance(np.clip(command, self.action_space.low, self.action_space.high))
+        if command.shape != self._low.shape or not np.isfinite(command).all():
+            raise ValueError(f"action must be {self._low.shape} finite numbers, got {action!r}.")
+        self._advance(np.clip(command, self._low, self._high))
         self._steps += 1
         success = bool(self._env._check_success())
         truncated = not success and self._steps >= self.horizon
@@ -201,7 +202,7 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
             self.render()
         return self._observation(), float(success), success, truncated, {"is_success": success}
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
+    def render(self) -> np.ndarray | None:
         """
         The scene as an (height, width, 3) uint8 image for "rgb_array"; shown in MuJoCo's viewer for "human".
         """

@@ -17,7 +17,6 @@ CONTROL_FREQUENCY = 20  # Hz
 
 CUBE_SIZE_RANGE = (0.020, 0.022)  # metres: half extents that robosuite draws its cube from whenever it builds the scene
 CUBE_DENSITY = 1000.0  # kg / m^3
-CUBE_VISUAL_MASS = 1e-8  # kg, of the cube's second geom, which is only drawn
 
 
 def import_robosuite() -> ModuleType:
@@ -106,7 +105,7 @@ def set_cube_size(env: Any, size: np.ndarray) -> None:
     model.geom_rbound[geoms] = np.linalg.norm(size)
     model.geom_aabb[geoms, 3:] = size
     model.bvh_aabb[model.body_bvhadr[body] :][: model.body_bvhnum[body], 3:] = size
-    mass = CUBE_DENSITY * 8.0 * np.prod(size) + CUBE_VISUAL_MASS
+    mass = CUBE_DENSITY * 8.0 * np.prod(size)
     squares = np.square(size)
     model.body_mass[body] = mass
     model.body_inertia[body] = mass / 3.0 * (squares.sum() - squares)

@@ -5,7 +5,7 @@ import os
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Generator
 from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
@@ -108,7 +108,7 @@ def _n_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _attempts(task: str, seed: int, n_workers: int, limit: int) -> Iterator[RecordedEpisode | None]:
+def _attempts(task: str, seed: int, n_workers: int, limit: int) -> Generator[RecordedEpisode | None, None, None]:
     """Episodes in the order of attempts, None for a failed one."""
     if n_workers == 1:
         yield from (_attempt(task, seed, attempt) for attempt in range(limit))

@@ -1,5 +1,6 @@
 """Running episodes side by side and keeping what happened in them."""
 
+import copy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -72,7 +73,7 @@ def run_episodes(envs: Sequence[gym.Env], act: ActFunction, n_episodes: int, see
     seeds = [int(number) for number in np.random.default_rng(seed).integers(2**31, size=n_episodes)]
     n_rows = min(len(envs), n_episodes)
     numbers = list(range(n_rows))
-    running = [RecordedEpisode(seeds[row], [envs[row].reset(seed=seeds[row])[0]]) for row in range(n_rows)]
+    running = [start(envs[row], seeds[row]) for row in range(n_rows)]
     starts = np.ones(n_rows, dtype=bool)
     active = np.ones(n_rows, dtype=bool)
     finished: dict[int, RecordedEpisode] = {}
@@ -87,8 +88,7 @@ def run_episodes(envs: Sequence[gym.Env], act: ActFunction, n_episodes: int, see
             if n_started == n_episodes:
                 active[row] = False
                 continue
-            first_observation = envs[row].reset(seed=seeds[n_started])[0]
-            running[row] = RecordedEpisode(seeds[n_started], [first_observation])
+            running[row] = start(envs[row], seeds[n_started])
             numbers[row], starts[row] = n_started, True
             n_started += 1
         while n_yielded in finished:
@@ -96,11 +96,17 @@ def run_episodes(envs: Sequence[gym.Env], act: ActFunction, n_episodes: int, see
             n_yielded += 1
 
 
+def start(env: gym.Env, seed: int) -> RecordedEpisode:
+    """Reset the environment and record its first observation."""
+    return RecordedEpisode(seed, [copy.deepcopy(env.reset(seed=seed)[0])])
+
+
 def step(env: gym.Env, episode: RecordedEpisode, action: np.ndarray) -> bool:
     """Execute and record one action. True if the episode is over."""
+    episode.actions.append(action.copy())
     observation, reward, terminated, truncated, _ = env.step(action)
-    episode.observations.append(observation)
-    episode.actions.append(action)
+    # An environment may hand out the same array at every step.
+    episode.observations.append(copy.deepcopy(observation))
     episode.reward_list.append(float(reward))
     episode.terminated, episode.truncated = bool(terminated), bool(truncated)
     return episode.terminated or episode.truncated

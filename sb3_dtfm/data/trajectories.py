@@ -150,7 +150,7 @@ class TrajectoryBuffer:
             lengths = [len(trajectory) for trajectory in trajectories]
         if len(lengths) == 0:
             raise DatasetError(f"{source}: holds no episode; at least one is needed.")
-        n_steps, episode = int(np.sum(lengths)), 0
+        n_steps = int(np.sum(lengths))
         rewards = np.empty(n_steps, np.float32)
         to_go = np.empty(n_steps, np.float32)
         timesteps = np.empty(n_steps, np.int32)
@@ -158,11 +158,14 @@ class TrajectoryBuffer:
         observations = np.empty((0, 0), np.float32)
         episode_returns = np.empty(len(lengths), np.float64)
         ends = np.zeros((2, len(lengths)), bool)
-        start = 0
-        for episode, trajectory in enumerate(trajectories):
+        start = n_read = 0
+        for trajectory in trajectories:
+            if n_read == len(lengths) or len(trajectory) != lengths[n_read]:
+                announced = f"{lengths[n_read]} steps" if n_read < len(lengths) else "no such episode"
+                raise DatasetError(f"{source}, {trajectory.name}: holds {len(trajectory)} steps, announced: {announced}.")
             if observation_space is None:
                 observation_space = spaces.Box(-np.inf, np.inf, np.shape(trajectory.observations)[1:], np.float32)
-            if episode == 0:
+            if n_read == 0:
                 observations = np.empty((n_steps, *observation_space.shape), np.float32)
             check_trajectory(trajectory, observation_space, action_space, source)
             stop = start + len(trajectory)
@@ -171,13 +174,11 @@ class TrajectoryBuffer:
             rewards[start:stop] = trajectory.rewards
             to_go[start:stop] = returns_to_go(trajectory.rewards)
             timesteps[start:stop] = np.arange(len(trajectory))
-            episode_returns[episode] = np.sum(trajectory.rewards, dtype=np.float64)
-            ends[:, episode] = trajectory.terminated, trajectory.truncated
-            start = stop
-        if episode + 1 != len(lengths) or start != n_steps:
-            raise DatasetError(
-                f"{source}: announces {len(lengths)} episodes of {n_steps} steps in all, but {episode + 1} of {start} can be read."
-            )
+            episode_returns[n_read] = np.sum(trajectory.rewards, dtype=np.float64)
+            ends[:, n_read] = trajectory.terminated, trajectory.truncated
+            start, n_read = stop, n_read + 1
+        if n_read != len(lengths):
+            raise DatasetError(f"{source}: announces {len(lengths)} episodes, but only {n_read} can be read.")
         assert observation_space is not None
         arrays = {
             "observations": observations,
@@ -303,11 +304,11 @@ def check_trajectory(
         array = getattr(trajectory, name)
         if np.shape(array) != shape:
             raise DatasetError(f"{where}: {name} have shape {np.shape(array)}, expected {shape}.")
-        bad = ~np.isfinite(array)
+        bad = ~(np.abs(array) <= np.finfo(np.float32).max)  # also True for NaN
         if bad.any():
             index = tuple(int(i) for i in np.argwhere(bad)[0])
             column = f", dimension {index[1]}" if len(index) > 1 else ""
-            raise DatasetError(f"{where}, step {index[0]}: {name} hold {array[index]}{column}; numbers must be finite.")
+            raise DatasetError(f"{where}, step {index[0]}: {name} hold {array[index]}{column}; numbers must be finite in float32.")
     slack = ACTION_TOLERANCE * (action_space.high - action_space.low)
     outside = (trajectory.actions < action_space.low - slack) | (trajectory.actions > action_space.high + slack)
     if outside.any():

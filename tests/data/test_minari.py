@@ -199,7 +199,7 @@ def test_zeroed_bytes_in_the_file_are_found():
 def test_missing_or_broken_metadata_is_named(content: str | None, datasets_path: Path):
     metadata = data_file(write([make_episode(3)]), "metadata.json")
     metadata.unlink() if content is None else metadata.write_text(content)
-    with pytest.raises(DatasetError, match="test/set-v0.*damaged or incomplete") as caught:
+    with pytest.raises(DatasetError, match=r"test/set-v0.*damaged or incomplete") as caught:
         load_minari("test/set-v0")
     assert str(datasets_path) in str(caught.value)
 
@@ -251,5 +251,5 @@ def test_only_bounded_box_actions_are_accepted(space: spaces.Space, actions: np.
 def test_images_are_refused():
     images = np.zeros((4, 40, 40, 3), np.uint8)
     dataset = write([make_episode(3, observations=images)], observation_space=spaces.Box(0, 255, (40, 40, 3), np.uint8))
-    with pytest.raises(DatasetError, match="test/set-v0.*holds an image"):
+    with pytest.raises(DatasetError, match=r"test/set-v0.*holds an image"):
         load_minari(dataset)

@@ -21,7 +21,11 @@ SHORT = {"max_episode_steps": 15}
 
 
 class Countdown(gym.Env):
-    """Episodes of 1 to 40 steps, the number drawn at reset; it breaks at the step `breaks_at` of its life."""
+    """
+    Episodes of 1 to 40 steps, the number drawn at reset; it breaks at the step `breaks_at` of its life.
+
+    Observations are one array that changes in place.
+    """
 
     observation_space = spaces.Box(0.0, 100.0, (1,), np.float64)
     action_space = spaces.Box(np.array([-2.0], np.float32), np.array([1.0], np.float32))
@@ -29,22 +33,25 @@ class Countdown(gym.Env):
     def __init__(self, breaks_at: int | None = None) -> None:
         self.breaks_at = breaks_at
         self.n_steps = 0
+        self.left = np.zeros(1)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
         super().reset(seed=seed)
-        self.left = int(self.np_random.integers(1, 41))
-        return np.array([float(self.left)]), {}
+        self.left[0] = self.np_random.integers(1, 41)
+        return self.left, {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         self.n_steps += 1
         if self.n_steps == self.breaks_at:
             raise RuntimeError("the simulator broke")
         self.left -= 1
-        return np.array([float(self.left)]), float(action[0]), self.left == 0, False, {}
+        return self.left, float(action[0]), bool(self.left == 0), False, {}
 
 
 gym.register("Countdown-v0", entry_point=Countdown)
-pytestmark = pytest.mark.filterwarnings("ignore:The environment cannot be recovered", "ignore:.*render_mode")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:The environment cannot be recovered", "ignore:.*render_mode", "ignore:.*share an object"
+)
 
 
 @pytest.fixture(autouse=True)
@@ -213,9 +220,9 @@ def test_a_recording_that_breaks_leaves_nothing_behind(countdown_agent: Path, da
     record(countdown_agent, "Countdown-v0", 2)
     before = sorted(datasets_path.rglob("*"))
     for dataset_id in ("test/recorded-v0", "test/new-v0"):
+        settings = {"dataset_id": dataset_id, "env_kwargs": {"breaks_at": 300}, "overwrite": True, "n_envs": 2}
         with pytest.raises(RuntimeError, match="the simulator broke"):
-            broken = {"breaks_at": 300}
-            record(countdown_agent, "Countdown-v0", 100, dataset_id=dataset_id, env_kwargs=broken, overwrite=True, n_envs=2)
+            record(countdown_agent, "Countdown-v0", 100, **settings)
     assert sorted(datasets_path.rglob("*")) == before
     assert minari.load_dataset("test/recorded-v0").total_episodes == 2
 

@@ -134,8 +134,14 @@ def test_fewer_episodes_than_announced_are_refused():
         TrajectoryBuffer.from_trajectories(iter([make_trajectory(3)]), ACTION_SPACE, lengths=[3, 2])
 
 
+@pytest.mark.parametrize("lengths", [[3], [3, 1], [3, 5]])
+def test_more_or_other_steps_than_announced_are_refused(lengths: list[int]):
+    with pytest.raises(DatasetError, match="holds 2 steps, announced"):
+        TrajectoryBuffer.from_trajectories(iter([make_trajectory(3), make_trajectory(2)]), ACTION_SPACE, lengths=lengths)
+
+
 def test_no_episode_is_refused():
-    with pytest.raises(DatasetError, match="file.hdf5: holds no episode"):
+    with pytest.raises(DatasetError, match=r"file.hdf5: holds no episode"):
         TrajectoryBuffer.from_trajectories([], ACTION_SPACE, source="file.hdf5")
 
 
@@ -156,6 +162,7 @@ GOOD = make_trajectory(6)
         ({"actions": np.zeros((6, 1))}, r"actions have shape \(6, 1\), expected \(6, 2\)"),
         ({"rewards": np.zeros((6, 1))}, r"rewards have shape \(6, 1\), expected \(6,\)"),
         ({"observations": with_value(GOOD.observations, (4, 2), np.nan)}, "step 4: observations hold nan, dimension 2"),
+        ({"observations": with_value(GOOD.observations, (0, 1), 1e39)}, "step 0: observations hold 1e.39, .*float32"),
         ({"actions": with_value(GOOD.actions, (3, 1), np.inf)}, "step 3: actions hold inf, dimension 1"),
         ({"rewards": with_value(GOOD.rewards, (5,), -np.inf)}, "step 5: rewards hold -inf"),
         ({"actions": with_value(GOOD.actions, (2, 1), 2.5)}, r"step 2: action 2.5 in dimension 1 .*\[-2, 2\]"),

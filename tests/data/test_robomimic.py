@@ -1,0 +1,389 @@
+"""robomimic files in the layouts of robosuite 1.4.1 and 1.5, written by hand: what is read, and what is refused."""
+
+import json
+import os
+
+import h5py
+import numpy as np
+import pytest
+
+from sb3_dtfm.data.robomimic import RecordedEpisode, RobomimicWriter, load_robomimic
+from sb3_dtfm.data.trajectories import DatasetError
+
+ROBOT = {"robot0_eef_pos": 3, "robot0_eef_quat": 4, "robot0_gripper_qpos": 2}
+OLD_CONTROLLER = {"type": "OSC_POSE", "input_max": 1, "input_min": -1, "control_delta": True, "kp": 150}
+NEW_CONTROLLER = {
+    "type": "BASIC",
+    "body_parts": {"right": {"type": "OSC_POSE", "input_max": 1, "input_min": -1, "input_type": "delta"}},
+}
+
+
+def env_args(name="Lift", version="1.5.1", **kwargs):
+    controller = OLD_CONTROLLER if version < "1.5" else NEW_CONTROLLER
+    common = {"robots": ["Panda"], "control_freq": 20, "controller_configs": controller, "reward_shaping": False}
+    return {"env_name": name, "env_version": version, "type": 1, "env_kwargs": {**common, **kwargs}}
+
+
+def make_demo(n_steps, success_at=None, seed=0, object_width=10):
+    """One demonstration as robomimic stores it: rewarded from the first success on, done there and at the end."""
+    rng = np.random.default_rng(seed)
+    rewards = np.zeros(n_steps)
+    if success_at is not None:
+        rewards[success_at:] = 1.0
+    dones = rewards.astype(np.int64)
+    dones[-1] = 1
+    observations = {key: rng.normal(size=(n_steps, width)) for key, width in ROBOT.items()}
+    observations["object"] = rng.normal(size=(n_steps, object_width))
+    observations["robot0_joint_pos"] = rng.normal(size=(n_steps, 7))
+    return {"obs": observations, "actions": rng.uniform(-1, 1, (n_steps, 7)), "rewards": rewards, "dones": dones}
+
+
+def write(path, demos, arguments=None, masks=None):
+    """The layout of robomimic's own files; `demos` maps names to what `make_demo` returns."""
+    with h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        data.attrs["total"] = sum(len(demo["actions"]) for demo in demos.values())
+        data.attrs["env_args"] = json.dumps(arguments or env_args(), indent=4)
+        for name, demo in demos.items():
+            group = data.create_group(name)
+            group.attrs["num_samples"] = len(demo["actions"])
+            group.attrs["model_file"] = "<mujoco/>"
+            group["states"] = np.zeros((len(demo["actions"]), 32))
+            for key, values in demo.items():
+                if key == "obs":
+                    for observation, array in values.items():
+                        group[f"obs/{observation}"] = array
+                        group[f"next_obs/{observation}"] = np.roll(array, -1, axis=0)
+                else:
+                    group[key] = values
+        for key, names in (masks or {}).items():
+            file[f"mask/{key}"] = names
+    return path
+
+
+def stacked(demo, keys=(*ROBOT, "object")):
+    return np.concatenate([demo["obs"][key] for key in keys], axis=1).astype(np.float32)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "demos.hdf5"
+
+
+@pytest.mark.parametrize("version", ["1.4.1", "1.5.1"])
+def test_both_layouts_are_read(path, version):
+    demos = {f"demo_{i}": make_demo(6 + i, success_at=5 + i, seed=i) for i in range(3)}
+    buffer = load_robomimic(write(path, demos, env_args(version=version)))
+    assert buffer.episode_lengths.tolist() == [6, 7, 8]
+    np.testing.assert_array_equal(buffer.observations, np.concatenate([stacked(demo) for demo in demos.values()]))
+    actions = np.concatenate([demo["actions"] for demo in demos.values()]).astype(np.float32)
+    np.testing.assert_array_equal(buffer.actions, actions)
+    assert buffer.action_space.low.tolist() == [-1.0] * 7
+    assert buffer.action_space.high.tolist() == [1.0] * 7
+    assert buffer.source == str(path)
+
+
+def test_demonstrations_come_in_numerical_order(path):
+    demos = {f"demo_{i}": make_demo(i + 1, success_at=i) for i in (10, 2, 0, 1)}
+    assert load_robomimic(write(path, demos)).episode_lengths.tolist() == [1, 2, 3, 11]
+
+
+def test_episode_ends_at_its_first_success(path):
+    demos = {"demo_0": make_demo(20, success_at=12), "demo_1": make_demo(9, success_at=8)}
+    buffer = load_robomimic(write(path, demos))
+    assert buffer.episode_lengths.tolist() == [13, 9]
+    assert buffer.episode_returns.tolist() == [1.0, 1.0]
+    assert buffer.rewards.nonzero().flatten().tolist() == [12, 21]
+    assert buffer.terminated.tolist() == [True, True]
+    assert buffer.truncated.tolist() == [False, False]
+
+
+def test_failed_episode_is_truncated_and_a_broken_off_one_is_neither(path):
+    broken_off = make_demo(5)
+    broken_off["dones"][:] = 0
+    demos = {"demo_0": make_demo(5, success_at=4), "demo_1": make_demo(7), "demo_2": broken_off}
+    buffer = load_robomimic(write(path, demos))
+    assert buffer.episode_returns.tolist() == [1.0, 0.0, 0.0]
+    assert buffer.terminated.tolist() == [True, False, False]
+    assert buffer.truncated.tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("stored", ["zeros", "nothing"])
+def test_without_rewards_the_first_done_step_is_the_success(path, stored):
+    demos = {"demo_0": make_demo(8, success_at=5), "demo_1": make_demo(4)}
+    for demo in demos.values():
+        if stored == "zeros":
+            demo["rewards"][:] = 0.0
+        else:
+            del demo["rewards"]
+    buffer = load_robomimic(write(path, demos))
+    assert buffer.episode_lengths.tolist() == [6, 4]
+    assert buffer.episode_returns.tolist() == [1.0, 1.0]
+    assert buffer.terminated.all()
+
+
+def test_without_rewards_and_dones_the_last_step_is_the_success(path):
+    demo = make_demo(6)
+    del demo["rewards"], demo["dones"]
+    buffer = load_robomimic(write(path, {"demo_0": demo}))
+    assert buffer.rewards.tolist() == [0.0] * 5 + [1.0]
+
+
+def test_dense_rewards_are_kept(path):
+    demo = make_demo(4, success_at=2)
+    demo["rewards"] = np.array([0.125, 0.5, 1.0, 1.0])
+    buffer = load_robomimic(write(path, {"demo_0": demo}, env_args(reward_shaping=True)))
+    assert buffer.rewards.tolist() == [0.125, 0.5, 1.0, 1.0]
+    assert buffer.terminated.tolist() == [True]
+
+
+@pytest.mark.parametrize("dtype", ["S", "O"])
+def test_filter_key_selects(path, dtype):
+    demos = {f"demo_{i}": make_demo(i + 1, success_at=i) for i in range(12)}
+    names = np.array(["demo_10", "demo_2", "demo_4"], dtype=dtype)
+    write(path, demos, masks={"train": names, "valid": np.array(["demo_1"], dtype="S")})
+    assert load_robomimic(path, filter_key="train").episode_lengths.tolist() == [3, 5, 11]
+    assert load_robomimic(path).n_episodes == 12
+
+
+def test_observation_keys_are_chosen_in_order(path):
+    demo = make_demo(5, success_at=4)
+    keys = ("robot0_joint_pos", "robot0_eef_pos")
+    buffer = load_robomimic(write(path, {"demo_0": demo}), observation_keys=keys)
+    np.testing.assert_array_equal(buffer.observations, stacked(demo, keys))
+
+
+@pytest.mark.parametrize(("stored", "asked"), [("object-state", "object"), ("object", "object-state")])
+def test_object_state_has_two_names(path, stored, asked):
+    demo = make_demo(5, success_at=4)
+    expected = stacked(demo)
+    demo["obs"][stored] = demo["obs"].pop("object")
+    buffer = load_robomimic(write(path, {"demo_0": demo}), observation_keys=(*ROBOT, asked))
+    np.testing.assert_array_equal(buffer.observations, expected)
+
+
+def test_old_lift_files_get_the_present_sign(path):
+    demo = make_demo(5, success_at=4)
+    observations = demo["obs"]
+    observations["object"][:, 7:] = observations["robot0_eef_pos"] - observations["object"][:, :3]
+    read = load_robomimic(write(path, {"demo_0": demo}, env_args(version="1.4.1"))).observations
+    np.testing.assert_allclose(read[:, 16:], read[:, 9:12] - read[:, :3], atol=1e-6)
+    kept = load_robomimic(write(path, {"demo_0": demo}, env_args(version="1.5.1"))).observations
+    np.testing.assert_array_equal(kept, stacked(demo))
+
+
+def test_old_can_files_get_the_present_order(path):
+    demo = make_demo(5, success_at=4, object_width=14)
+    observations, state = demo["obs"], demo["obs"]["object"]
+    quarter_turn = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])  # the hand's x axis is the world's y axis
+    observations["robot0_eef_quat"][:] = quarter_turn
+    away = state[:, :3] - observations["robot0_eef_pos"]
+    state[:, 7:10] = np.stack([away[:, 1], -away[:, 0], away[:, 2]], axis=1)
+    read = load_robomimic(write(path, {"demo_0": demo}, env_args("PickPlaceCan", "1.4.1"))).observations
+    np.testing.assert_array_equal(read[:, 9:], np.concatenate([state[:, 7:], state[:, :7]], axis=1).astype(np.float32))
+    kept = load_robomimic(write(path, {"demo_0": demo}, env_args("PickPlaceCan", "1.5.1"))).observations
+    np.testing.assert_array_equal(kept, stacked(demo))
+
+
+def test_wider_controller_inputs_widen_the_action_space(path):
+    demo = make_demo(5, success_at=4)
+    demo["actions"][:, 0] = 1.5
+    controller = {**OLD_CONTROLLER, "input_max": 2, "input_min": -2}
+    buffer = load_robomimic(write(path, {"demo_0": demo}, env_args(controller_configs=controller)))
+    assert buffer.action_space.high.tolist() == [2.0] * 6 + [1.0]
+
+
+def refused(path, **arguments):
+    with pytest.raises(DatasetError) as caught:
+        load_robomimic(path, **arguments)
+    assert str(path) in str(caught.value)
+    return str(caught.value)
+
+
+def test_missing_file_is_named(path):
+    assert "no such file" in refused(path)
+
+
+def test_other_kinds_of_file_are_named(path):
+    path.write_text("no hdf5")
+    assert "not an hdf5 file" in refused(path)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.9, 0.999])
+def test_cut_off_file_is_named(path, share):
+    write(path, {f"demo_{i}": make_demo(50, success_at=49) for i in range(5)})
+    os.truncate(path, int(share * path.stat().st_size))
+    assert "cut off" in refused(path)
+
+
+def test_file_without_data_is_named(path):
+    with h5py.File(path, "w") as file:
+        file["episodes"] = np.zeros(3)
+    assert "has no group 'data', only 'episodes'" in refused(path)
+
+
+def test_file_without_demonstrations_is_named(path):
+    assert "holds no demonstration" in refused(write(path, {}))
+
+
+def test_unknown_filter_key_lists_the_known(path):
+    write(path, {"demo_0": make_demo(3)}, masks={"train": np.array([b"demo_0"]), "valid": np.array([b"demo_0"])})
+    assert "has no filter key 'test'; available: 'train', 'valid'" in refused(path, filter_key="test")
+
+
+def test_filter_key_of_absent_demonstrations_is_named(path):
+    write(path, {"demo_0": make_demo(3)}, masks={"train": np.array([b"demo_7"]), "none": np.array([], dtype="S6")})
+    assert "'train' lists 'demo_7', which is not in" in refused(path, filter_key="train")
+    assert "'none' lists no demonstration" in refused(path, filter_key="none")
+
+
+def test_unknown_observation_key_lists_the_known(path):
+    write(path, {"demo_0": make_demo(3)})
+    message = refused(path, observation_keys=["agentview_image"])
+    assert "demo_0: has no observation 'agentview_image'; available: 'object', 'robot0_eef_pos'" in message
+
+
+def test_demonstration_without_observations_is_named(path):
+    demo = make_demo(3)
+    demo["obs"] = {}
+    assert "demo_0: has no group 'obs'" in refused(write(path, {"demo_0": demo}))
+
+
+def change(name, value):
+    def apply(demo):
+        demo[name] = value(demo[name])
+
+    return apply
+
+
+def spoil(name, step, column, value):
+    def apply(demo):
+        array = demo["obs"][name] if name in demo["obs"] else demo[name]
+        array[step, column] = value
+
+    return apply
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (change("actions", lambda a: a[:, 0]), "demo_1: actions have shape (6,), expected (steps, dimensions)"),
+        (change("actions", lambda a: a[:0]), "demo_1: actions have shape (0, 7)"),
+        (change("actions", lambda a: a[:, :5]), "demo_1: actions have shape (6, 5), expected (6, 7)"),
+        (change("rewards", lambda r: r[:4]), "demo_1: rewards have shape (4,), expected (6,)"),
+        (change("dones", lambda d: d[:4]), "demo_1: dones have shape (4,), expected (6,)"),
+        (
+            change("obs", lambda o: {**o, "object": o["object"][:3]}),
+            "demo_1: observation 'object' has shape (3, 10), expected (6, dimensions)",
+        ),
+        (
+            change("obs", lambda o: {**o, "object": np.zeros((6, 8, 8, 3))}),
+            "demo_1: observation 'object' has shape (6, 8, 8, 3), expected (6, dimensions)",
+        ),
+        (
+            change("obs", lambda o: {**o, "object": o["object"][:, :3]}),
+            "demo_1: observations have shape (6, 12), expected (6, 19)",
+        ),
+        (spoil("object", 2, 4, np.nan), "demo_1, step 2: observations hold nan, dimension 13; numbers must be finite"),
+        (spoil("actions", 3, 1, np.inf), "demo_1, step 3: actions hold inf"),
+        (spoil("actions", 3, 1, 1.7), "demo_1, step 3: action 1.7 in dimension 1 lies outside of the action space [-1, 1]"),
+    ],
+)
+def test_damaged_demonstration_is_named(path, damage, message):
+    demos = {"demo_0": make_demo(6, success_at=5), "demo_1": make_demo(6, success_at=5)}
+    damage(demos["demo_1"])
+    assert message in refused(write(path, demos))
+
+
+def test_demonstration_without_actions_is_named(path):
+    demo = make_demo(3)
+    write(path, {"demo_0": demo})
+    with h5py.File(path, "a") as file:
+        del file["data/demo_0/actions"]
+    assert "demo_0: has no 'actions', only 'dones'" in refused(path)
+
+
+def test_nan_reward_is_named(path):
+    demo = make_demo(6, success_at=5)
+    demo["rewards"][2] = np.nan
+    assert "demo_0, step 2: rewards hold nan" in refused(write(path, {"demo_0": demo}))
+
+
+@pytest.mark.parametrize("controller", [{"control_delta": False}, {"input_type": "absolute"}])
+def test_absolute_actions_are_refused(path, controller):
+    write(path, {"demo_0": make_demo(3)}, env_args(controller_configs={**OLD_CONTROLLER, **controller}))
+    assert "only files with a delta controller are accepted" in refused(path)
+
+
+def test_broken_env_args_are_named(path):
+    write(path, {"demo_0": make_demo(3)})
+    with h5py.File(path, "a") as file:
+        file["data"].attrs["env_args"] = "{"
+    assert "'env_args' of group 'data' is not JSON" in refused(path)
+
+
+def make_episode(n_steps, seed=0):
+    rng = np.random.default_rng(seed)
+    rewards = np.zeros(n_steps)
+    rewards[-1] = 1.0
+    observations = {key: rng.normal(size=(n_steps + 1, width)) for key, width in {**ROBOT, "object": 10}.items()}
+    return RecordedEpisode(
+        observations, rng.uniform(-1, 1, (n_steps, 7)), rewards, rng.normal(size=(n_steps, 32)), "<mujoco/>"
+    )
+
+
+def test_written_file_has_robomimics_layout_and_reads_back(path):
+    episodes = [make_episode(4 + i, seed=i) for i in range(20)]
+    with RobomimicWriter(path, env_args()) as writer:
+        for episode in episodes:
+            writer.add(episode)
+    with h5py.File(path) as file:
+        data = file["data"]
+        assert data.attrs["total"] == sum(len(episode.actions) for episode in episodes)
+        assert json.loads(data.attrs["env_args"]) == env_args()
+        demo = data["demo_3"]
+        assert demo.attrs["num_samples"] == 7
+        assert demo.attrs["model_file"] == "<mujoco/>"
+        assert set(demo) == {"obs", "next_obs", "actions", "rewards", "dones", "states"}
+        np.testing.assert_array_equal(demo["obs/object"][1:], demo["next_obs/object"][:-1])
+        assert demo["dones"][()].tolist() == [0] * 6 + [1]
+        masks = {key: {name.decode() for name in file[f"mask/{key}"][()]} for key in file["mask"]}
+    assert masks["train"] | masks["valid"] == {f"demo_{i}" for i in range(20)}
+    assert not masks["train"] & masks["valid"]
+    assert [len(masks[key]) for key in ("train", "valid", "50_percent")] == [18, 2, 10]
+    buffer = load_robomimic(path)
+    assert buffer.episode_lengths.tolist() == [4 + i for i in range(20)]
+    np.testing.assert_array_equal(
+        buffer.actions, np.concatenate([episode.actions for episode in episodes]).astype(np.float32)
+    )
+    assert load_robomimic(path, filter_key="50_percent").n_episodes == 10
+
+
+def test_file_appears_only_when_complete(path):
+    with RobomimicWriter(path, env_args()) as writer:
+        writer.add(make_episode(4))
+        assert not path.exists()
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+def test_interrupted_writing_leaves_the_old_file(path):
+    path.write_text("old")
+    writer = RobomimicWriter(path, env_args(), overwrite=True)
+
+    def interrupt():
+        with writer:
+            writer.add(make_episode(4))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupt()
+    assert path.read_text() == "old"
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+def test_existing_file_is_not_overwritten(path):
+    path.write_text("old")
+    with pytest.raises(FileExistsError, match="exists already; pass overwrite=True"):
+        RobomimicWriter(path, env_args())
+    with pytest.raises(FileExistsError, match="is a folder"):
+        RobomimicWriter(path.parent, env_args(), overwrite=True)

@@ -1,0 +1,180 @@
+"""The scripted demonstrators: success, variety, repetition, recovery, and what recording makes of them."""
+
+import h5py
+import numpy as np
+import pytest
+
+from sb3_dtfm.data.record_demonstrations import RecordingSummary, record_demonstrations
+from sb3_dtfm.data.robomimic import load_robomimic
+from sb3_dtfm.envs.demonstrators import DEMONSTRATORS, DOWNWARD, LiftDemonstrator, _rotation_between
+from sb3_dtfm.envs.robosuite import RobosuiteEnv
+
+
+@pytest.fixture(scope="module")
+def lift():
+    env = RobosuiteEnv("Lift")
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    path = tmp_path_factory.mktemp("recording") / "lift.hdf5"
+    return path, record_demonstrations("lift", 4, path, seed=3, n_workers=1, progress=False)
+
+
+def demonstrate(env, seed, demonstrator_seed=None):
+    observation, _ = env.reset(seed=seed)
+    demonstrator = DEMONSTRATORS[env.task](seed if demonstrator_seed is None else demonstrator_seed)
+    actions, terminated, truncated = [], False, False
+    while not (terminated or truncated):
+        actions.append(demonstrator.act(observation))
+        observation, _, terminated, truncated, _ = env.step(actions[-1])
+    return np.stack(actions), terminated
+
+
+def contents(path):
+    """Every array and attribute of a file, by name."""
+    found = {}
+
+    def visit(name, node):
+        found.update({f"{name}@{key}": value for key, value in node.attrs.items()})
+        if isinstance(node, h5py.Dataset):
+            found[name] = node[()]
+
+    with h5py.File(path) as file:
+        file.visititems(visit)
+    return found
+
+
+def assert_same_file(first, second):
+    first, second = contents(first), contents(second)
+    assert first.keys() == second.keys()
+    for name, value in first.items():
+        np.testing.assert_array_equal(value, second[name], err_msg=name)
+
+
+def test_lift_succeeds(lift):
+    runs = [demonstrate(lift, seed) for seed in range(5)]
+    assert all(success for _, success in runs)
+    assert np.mean([len(actions) for actions, _ in runs]) < 73
+
+
+def test_can_succeeds():
+    env = RobosuiteEnv("Can")
+    runs = [demonstrate(env, seed) for seed in range(2)]
+    env.close()
+    assert all(success for _, success in runs)
+    assert np.mean([len(actions) for actions, _ in runs]) < 167
+
+
+def test_actions_are_smooth_and_within_bounds(lift):
+    actions, _ = demonstrate(lift, 0)
+    assert actions.dtype == np.float32
+    assert np.abs(actions).max() <= 1.0
+    assert np.abs(np.diff(actions[:, :3], axis=0)).max() < 0.8
+    assert set(actions[:, 6]) == {-1.0, 1.0}
+
+
+def test_seed_decides_and_another_seed_does_otherwise(lift):
+    first, _ = demonstrate(lift, 2, demonstrator_seed=5)
+    again, _ = demonstrate(lift, 2, demonstrator_seed=5)
+    other, _ = demonstrate(lift, 2, demonstrator_seed=6)
+    np.testing.assert_array_equal(first, again)
+    assert first.shape != other.shape or not np.array_equal(first, other)
+
+
+def test_each_episode_of_one_demonstrator_has_its_own_manner():
+    demonstrator = LiftDemonstrator(0)
+    first = demonstrator.manner
+    demonstrator.reset()
+    assert demonstrator.manner.speed != first.speed
+
+
+def test_cube_pushed_away_from_the_fingers_is_fetched(lift):
+    observation, _ = lift.reset(seed=4)
+    demonstrator = LiftDemonstrator(4)
+    stages, pushed, terminated, truncated = [], False, False, False
+    while not (terminated or truncated):
+        action = demonstrator.act(observation)
+        stages.append(demonstrator.stage)
+        if demonstrator.stage == "grasp" and not pushed:
+            pushed = True
+            sim = lift._env.sim
+            position = sim.data.get_joint_qpos("cube_joint0").copy()
+            sim.data.set_joint_qpos("cube_joint0", position + np.array([0.08, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        observation, _, terminated, truncated, _ = lift.step(action)
+    assert terminated
+    assert "hover" in stages[stages.index("grasp") :]
+
+
+def test_rotation_between_orientations_is_the_world_rotation():
+    half = 0.15  # of a turn of 0.3 rad around z, which leaves "downward" short by as much
+    turn = np.array([0.0, 0.0, np.sin(half), np.cos(half)])
+    turned = np.array([turn[3], turn[2], 0.0, 0.0])  # turn * DOWNWARD, as quaternions
+    np.testing.assert_allclose(_rotation_between(turned, DOWNWARD), [0.0, 0.0, -0.3], atol=1e-12)
+    np.testing.assert_allclose(_rotation_between(-turned, DOWNWARD), [0.0, 0.0, -0.3], atol=1e-12)
+    np.testing.assert_allclose(_rotation_between(DOWNWARD, DOWNWARD), np.zeros(3), atol=1e-12)
+
+
+def test_recording_is_the_same_with_any_number_of_workers(recording, tmp_path):
+    path, summary = recording
+    parallel = tmp_path / "parallel.hdf5"
+    other = record_demonstrations("lift", 4, parallel, seed=3, n_workers=2, progress=False)
+    assert_same_file(path, parallel)
+    assert other[1:4] == summary[1:4]
+
+
+def test_summary_and_file_agree(recording):
+    path, summary = recording
+    buffer = load_robomimic(path)
+    assert isinstance(summary, RecordingSummary)
+    assert summary.n_episodes == buffer.n_episodes == 4
+    assert summary.mean_length == buffer.episode_lengths.mean()
+    assert summary.success_rate == 4 / summary.n_attempts
+    assert str(path) in str(summary)
+    assert buffer.terminated.all()
+    assert not buffer.truncated.any()
+    np.testing.assert_array_equal(buffer.episode_returns, 1.0)
+    assert buffer.observation_space.shape == (19,)
+
+
+def test_recorded_actions_replay_to_the_recorded_observations(recording, lift):
+    path, _ = recording
+    buffer = load_robomimic(path)
+    ends = np.cumsum(buffer.episode_lengths)
+    with h5py.File(path) as file:
+        for episode in range(2):
+            demo = file[f"data/demo_{episode}"]
+            options = {"state": demo["states"][0], "model_file": demo.attrs["model_file"]}
+            observation, _ = lift.reset(options=options)
+            rows = range(ends[episode] - buffer.episode_lengths[episode], ends[episode])
+            for row in rows:
+                np.testing.assert_array_equal(observation, buffer.observations[row].numpy())
+                observation, reward, terminated, _, _ = lift.step(buffer.actions[row].numpy())
+                assert reward == buffer.rewards[row]
+            assert terminated
+
+
+def test_existing_recording_is_kept_unless_told_otherwise(recording):
+    path, _ = recording
+    before = path.read_bytes()
+    with pytest.raises(FileExistsError, match="exists already; pass overwrite=True"):
+        record_demonstrations("lift", 1, path, progress=False)
+    assert path.read_bytes() == before
+
+
+def test_failed_recording_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(RobosuiteEnv, "step", lambda self, action: (np.zeros(19, np.float32), 0.0, False, True, {}))
+    with pytest.raises(RuntimeError, match="Only 0 of 15 demonstrations of lift succeeded"):
+        record_demonstrations("lift", 1, tmp_path / "lift.hdf5", n_workers=1, progress=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(("stack", 1), "task must be one of 'lift', 'can', got 'stack'"), (("lift", 0), "n_episodes must be at least 1")],
+)
+def test_wrong_arguments_are_named(arguments, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        record_demonstrations(*arguments, tmp_path / "out.hdf5")
