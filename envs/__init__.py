@@ -10,6 +10,7 @@ from sb3_dtfm.envs.return_to_go import (
     RETURN_TO_GO,
     TIMESTEP,
     ReturnToGoWrapper,
+    check_vec_env,
     flatten_observation_space,
     return_to_go_space,
 )
@@ -27,6 +28,7 @@ __all__ = [
     "RETURN_TO_GO",
     "TIMESTEP",
     "ReturnToGoWrapper",
+    "check_vec_env",
     "flatten_observation_space",
     "register_robosuite_envs",
     "return_to_go_space",

@@ -12,6 +12,8 @@ TURN_SHARE = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])  # of the unsteadiness, pe
 
 OPEN, CLOSE = -1.0, 1.0
 OVERREACH = 0.012  # metres below the grasp point that the descent aims at, so that the hand does not creep the last bit
+MISJUDGEMENT_RATE = 0.1  # of episodes whose first grasp closes on air, which shows how to begin again
+FINGERS_OPEN = 0.03  # metres from the middle
 FINGERS_STILL = 4e-4  # metres per step
 DOWNWARD = np.array([1.0, 0.0, 0.0, 0.0])  # hand pointing down, as x y z w
 CAN_BIN_CENTRE = np.array([0.1975, 0.405])  # metres: the compartment of the target bin that is the can's
@@ -99,6 +101,7 @@ class Demonstrator:
     object_columns = slice(9, 12)  # where the observation holds the object's position
     smallest_grip = 0.012  # metres from the middle to a finger: closed further, it holds nothing
     grasp_height = 0.0  # metres above the object's centre
+    misjudgement = 0.04  # metres too high where a first grasp goes wrong
     speed_range = (0.55, 0.95)
     free_stages = ("hover", "descend")  # where a jerk does no harm
 
@@ -113,6 +116,8 @@ class Demonstrator:
         self._steps_in_stage = 0
         self._movement = np.zeros(6)
         self._unsteadiness = np.zeros(6)
+        misjudges = self._rng.random() < MISJUDGEMENT_RATE
+        self._misjudged_height = self.misjudgement * self._rng.uniform(0.8, 1.2) if misjudges else 0.0
         self._jerk = np.zeros(6)
         self._jerk_steps = 0
         self._fingers = 0.0
@@ -138,14 +143,16 @@ class Demonstrator:
         manner = self.manner
         to_grasp = self._grasp_point(position) - hand
         aside = float(np.hypot(*to_grasp[:2]))
-        if self.stage == "hover" and aside < manner.hover_tolerance + float(np.hypot(*manner.hover_offset)):
-            return "descend"
+        if self.stage == "hover":
+            above = aside < manner.hover_tolerance + float(np.hypot(*manner.hover_offset))
+            return "descend" if above and fingers > FINGERS_OPEN else "hover"
         if self.stage == "descend":
             if aside > 0.04:
                 return "hover"
-            if aside < manner.grasp_tolerance and -to_grasp[2] < manner.grasp_tolerance and fingers > 0.03:
+            if aside < manner.grasp_tolerance and -to_grasp[2] < manner.grasp_tolerance:
                 return "grasp"
         if self.stage == "grasp" and self._steps_in_stage >= 3 + manner.dwell and finger_speed < FINGERS_STILL:
+            self._misjudged_height = 0.0
             return self._after_grasp() if fingers > self.smallest_grip else "hover"
         if self.stage not in ("hover", "descend", "grasp"):
             return self._next_stage_holding(hand, position, fingers)
@@ -166,7 +173,7 @@ class Demonstrator:
         return self._target_holding(hand, position)
 
     def _grasp_point(self, position: np.ndarray) -> np.ndarray:
-        return position + self.manner.grasp_offset + np.array([0.0, 0.0, self.grasp_height])
+        return position + self.manner.grasp_offset + np.array([0.0, 0.0, self.grasp_height + self._misjudged_height])
 
     def _after_grasp(self) -> str:
         raise NotImplementedError
@@ -198,7 +205,6 @@ class Demonstrator:
         noise = manner.noise * effort * TURN_SHARE * self._unsteadiness + self._next_jerk()
         action = np.append(self._movement + noise, gripper)
         return np.clip(action, -1.0, 1.0).astype(np.float32)
-
 
     def _next_jerk(self) -> np.ndarray:
         """
@@ -237,6 +243,7 @@ class CanDemonstrator(Demonstrator):
 
     object_columns = slice(16, 19)
     grasp_height = 0.015
+    misjudgement = 0.055
     speed_range = (0.75, 1.15)  # it has half a metre to go
 
     def _after_grasp(self) -> str:

@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, is_vecenv_wrapped, unwrap_vec_normalize
 
 OBSERVATION = "observation"
 RETURN_TO_GO = "return_to_go"
@@ -137,3 +138,24 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             RETURN_TO_GO: np.array([self._return_to_go], dtype=np.float32),
             TIMESTEP: np.array([self._timestep], dtype=np.int64),
         }
+
+
+def check_vec_env(env: VecEnv) -> None:
+    """
+    Make sure that return-to-go and time step reach the policy unharmed.
+
+    :raises ValueError: no :class:`ReturnToGoWrapper` inside, or normalised or stacked observations
+    """
+    vec_normalize = unwrap_vec_normalize(env)
+    if vec_normalize is not None and vec_normalize.norm_obs:
+        raise ValueError(
+            "VecNormalize(norm_obs=True) would rescale return_to_go and timestep; the policy normalises observations "
+            "itself. Use norm_obs=False, or `normalize: false` in RL-Zoo's YAML."
+        )
+    if is_vecenv_wrapped(env, VecFrameStack):
+        raise ValueError("VecFrameStack would mix up return_to_go and timestep; set context_length instead.")
+    if set(getattr(env.observation_space, "spaces", {})) != {OBSERVATION, RETURN_TO_GO, TIMESTEP}:
+        raise ValueError(
+            "The environment must be wrapped in sb3_dtfm.envs.ReturnToGoWrapper(env, target_return=...), inside any "
+            f"vectorised environment; its observation space is {env.observation_space}."
+        )

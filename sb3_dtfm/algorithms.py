@@ -3,7 +3,7 @@
 import math
 import time
 from os import PathLike
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeAlias, TypeVar
 
 import minari
 import numpy as np
@@ -14,18 +14,16 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Conve
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import configure_logger, update_learning_rate
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, is_vecenv_wrapped, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dtfm.callbacks import GradientStepProgressBar, NormalizedScoreCallback, find_eval_callbacks
 from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer, load_dataset
-from sb3_dtfm.envs import return_to_go_space
+from sb3_dtfm.envs import check_vec_env, return_to_go_space
+from sb3_dtfm.optimization import LEARNING_RATE_SCHEDULES, PRECISIONS, RunningMeans, autocast, learning_rate_factor
 from sb3_dtfm.policies import DTFMPolicy, DTPolicy, SequencePolicy
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineSequenceAlgorithm")
-Dataset = str | PathLike[str] | minari.MinariDataset | TrajectoryBuffer
-
-LEARNING_RATE_SCHEDULES = ("constant", "linear", "cosine")
-PRECISIONS = ("auto", "float32", "bfloat16")
+Dataset: TypeAlias = str | PathLike[str] | minari.MinariDataset | TrajectoryBuffer
 
 
 class OfflineSequenceAlgorithm(BaseAlgorithm):
@@ -114,8 +112,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         self.max_timestep = 1000
         self.score_reference: ScoreReference | None = None
         self.buffer: TrajectoryBuffer | None = None
-        self._metric_sums: dict[str, th.Tensor] = {}
-        self._metric_steps = 0
+        self._means = RunningMeans()
         self._training_seconds = 0.0
         if _init_setup_model:
             self._check_arguments()
@@ -170,7 +167,9 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
             and np.allclose(self.action_space.high, buffer.action_space.high)
         )
         if not same_bounds:
-            raise DatasetError(f"{buffer.source} holds actions of {buffer.action_space}, the environment takes {self.action_space}.")
+            raise DatasetError(
+                f"{buffer.source} holds actions of {buffer.action_space}, the environment takes {self.action_space}."
+            )
         self.buffer = buffer.random_fraction(self.dataset_fraction, self.dataset_seed).to(self.device)
         return self.buffer
 
@@ -198,22 +197,9 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
 
         :raises ValueError: no return-to-go in the observation, or normalised or stacked observations
         """
-        env = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
-        vec_normalize = unwrap_vec_normalize(env)
-        if vec_normalize is not None and vec_normalize.norm_obs:
-            raise ValueError(
-                "VecNormalize(norm_obs=True) would rescale return_to_go and timestep; the policy normalises observations "
-                "itself. Use norm_obs=False, or `normalize: false` in RL-Zoo's YAML."
-            )
-        if is_vecenv_wrapped(env, VecFrameStack):
-            raise ValueError("VecFrameStack would mix up return_to_go and timestep; set context_length instead.")
-        keys = set(getattr(env.observation_space, "spaces", {}))
-        if keys != {"observation", "return_to_go", "timestep"}:
-            raise ValueError(
-                "The environment must be wrapped in sb3_dtfm.envs.ReturnToGoWrapper(env, target_return=...), inside any "
-                f"vectorised environment; its observation space is {env.observation_space}."
-            )
-        return env
+        vec_env = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        check_vec_env(vec_env)
+        return vec_env
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         if isinstance(callback, list):
@@ -247,7 +233,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
             total_timesteps += self.num_timesteps
         self._total_timesteps = total_timesteps
         self._num_timesteps_at_start = self.num_timesteps
-        self._reset_metrics()
+        self._means, self._training_seconds = RunningMeans(), 0.0
         if not self._custom_logger:
             self._logger = configure_logger(self.verbose, self.tensorboard_log, tb_log_name, reset_num_timesteps)
         return total_timesteps, self._init_callback(callback, progress_bar)
@@ -279,13 +265,12 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         generator = self._training_generator()
-        use_bfloat16 = self.precision == "bfloat16" or (self.precision == "auto" and has_fast_bfloat16(self.device))
-        autocast = th.autocast(self.device.type, dtype=th.bfloat16, enabled=use_bfloat16)
+        precision = autocast(self.precision, self.device)
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total_timesteps:
             step_start = time.perf_counter()
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
-            self._gradient_step(buffer, generator, autocast)
+            self._gradient_step(buffer, generator, precision)
             self.num_timesteps += 1
             self._training_seconds += time.perf_counter() - step_start
             if log_interval and (self.num_timesteps % log_interval == 0 or self.num_timesteps == total_timesteps):
@@ -296,11 +281,11 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         callback.on_training_end()
         return self
 
-    def _gradient_step(self, buffer: TrajectoryBuffer, generator: th.Generator, autocast: th.autocast) -> None:
+    def _gradient_step(self, buffer: TrajectoryBuffer, generator: th.Generator, precision: th.autocast) -> None:
         self.policy.set_training_mode(True)  # an evaluation in between leaves evaluation mode on
         self._update_learning_rate(self.policy.optimizer)
         batch = buffer.sample(self.batch_size, self.context_length, generator)
-        with autocast:
+        with precision:
             loss, parts = self.policy.compute_loss(batch, generator)
         self.policy.optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -310,16 +295,12 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         if self.ema_decay > 0:
             # A young average follows more closely, or the random start would stay in it for long.
             self.policy.update_ema(min(self.ema_decay, (1 + self._n_updates) / (10 + self._n_updates)))
-        self._add_metrics({"loss": loss, "grad_norm": grad_norm, **parts})
+        self._means.add({"loss": loss, "grad_norm": grad_norm, **parts})
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
-        progress = 1.0 - self._current_progress_remaining
-        factor = min(1.0, (self.num_timesteps + 1) / self.warmup_steps) if self.warmup_steps else 1.0
-        if self.learning_rate_schedule == "linear":
-            factor *= 1.0 - progress
-        elif self.learning_rate_schedule == "cosine":
-            factor *= 0.5 * (1.0 + math.cos(math.pi * progress))
-        self._current_learning_rate = factor * self.lr_schedule(self._current_progress_remaining)
+        remaining = self._current_progress_remaining
+        factor = learning_rate_factor(self.learning_rate_schedule, self.num_timesteps, 1.0 - remaining, self.warmup_steps)
+        self._current_learning_rate = factor * self.lr_schedule(remaining)
         for optimizer in optimizers if isinstance(optimizers, list) else [optimizers]:
             update_learning_rate(optimizer, self._current_learning_rate)
 
@@ -333,28 +314,19 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
             generator.manual_seed(int(entropy.generate_state(1, np.uint64)[0]))
         return generator
 
-    def _reset_metrics(self) -> None:
-        self._metric_sums, self._metric_steps, self._training_seconds = {}, 0, 0.0
-
-    def _add_metrics(self, metrics: dict[str, th.Tensor]) -> None:
-        """Sum on the device: reading a value would wait for it."""
-        for name, value in metrics.items():
-            previous = self._metric_sums.get(name)
-            self._metric_sums[name] = value.detach().clone() if previous is None else previous.add_(value.detach())
-        self._metric_steps += 1
-
     def dump_logs(self) -> None:
         """
         Log the means since the last call.
 
         :raises FloatingPointError: the loss is no longer finite
         """
-        if self._metric_steps == 0:
+        n_steps = self._means.n_values
+        if n_steps == 0:
             return
-        means = {name: float(total) / self._metric_steps for name, total in self._metric_sums.items()}
+        means = self._means.pop()
         if not math.isfinite(means["loss"]):
             raise FloatingPointError(
-                f"The loss became {means['loss']} within the {self._metric_steps} gradient steps before step {self.num_timesteps}. "
+                f"The loss became {means['loss']} within the {n_steps} gradient steps before step {self.num_timesteps}. "
                 "Try a lower learning_rate, warmup_steps or max_grad_norm."
             )
         for name, mean in means.items():
@@ -362,11 +334,11 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         self.logger.record("train/action_mse", self._training_action_mse())
         self.logger.record("train/learning_rate", self._current_learning_rate)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("time/steps_per_second", self._metric_steps / self._training_seconds)
+        self.logger.record("time/steps_per_second", n_steps / self._training_seconds)
         self.logger.record("time/time_elapsed", int((time.time_ns() - self.start_time) / 1e9), exclude="tensorboard")
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(step=self.num_timesteps)
-        self._reset_metrics()
+        self._training_seconds = 0.0
 
     def _training_action_mse(self) -> float:
         """`train/action_mse` on windows of the training data that belong to the step, so that it disturbs nothing."""
@@ -376,7 +348,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         return float(self.policy.action_mse(batch, generator))
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "dataset", "buffer", "_metric_sums"]
+        return [*super()._excluded_save_params(), "dataset", "buffer", "_means"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
@@ -459,10 +431,3 @@ class DTFM(OfflineSequenceAlgorithm):
 
     def _policy_arguments(self) -> dict[str, Any]:
         return {**super()._policy_arguments(), "regression_coef": self.regression_coef}
-
-
-def has_fast_bfloat16(device: th.device) -> bool:
-    """Whether matrix products in bfloat16 are faster than in float32 on this device."""
-    if device.type == "cuda":
-        return th.cuda.is_bf16_supported(including_emulation=False)
-    return th.cpu._is_avx512_bf16_supported() or th.cpu._is_amx_tile_supported()

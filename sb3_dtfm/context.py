@@ -4,9 +4,11 @@ The context window: the last K steps of every environment, as plain arrays.
 Pure functions: each returns new arrays and leaves its arguments alone, so a context can serve as SB3's `state`.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+
+OBSERVATION_KEYS = ("observation", "return_to_go", "timestep")
 
 
 class Context(NamedTuple):
@@ -80,3 +82,31 @@ def with_action(context: Context, action: np.ndarray) -> Context:
 
 def _shift(window: np.ndarray, newest: np.ndarray) -> np.ndarray:
     return np.concatenate((window[:, 1:], newest[:, None]), axis=1)
+
+
+def unpack_observation(observation: Any, observation_dim: int) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], bool]:
+    """
+    Take the wrapper's observation apart.
+
+    :param observation: Dict of `observation` (O,), `return_to_go` (1,), `timestep` (1,), or with a leading axis B
+    :param observation_dim: O
+    :return: observation (B, O) and return-to-go (B,) as float32, time step (B,) as int64; and whether B was there
+    :raises ValueError: not such a Dict, or another O
+    """
+    if not isinstance(observation, dict) or not set(OBSERVATION_KEYS) <= set(observation):
+        found = f"the keys {sorted(observation)}" if isinstance(observation, dict) else type(observation).__name__
+        raise ValueError(
+            f"The observation must be a dict with the keys {', '.join(OBSERVATION_KEYS)}, as "
+            f"sb3_dtfm.envs.ReturnToGoWrapper gives it; got {found}."
+        )
+    values = np.asarray(observation["observation"], dtype=np.float32)
+    if values.ndim not in (1, 2) or values.shape[-1] != observation_dim:
+        raise ValueError(
+            f"observation['observation'] has shape {values.shape}; "
+            f"({observation_dim},) or (n_envs, {observation_dim}) is expected."
+        )
+    vectorized = values.ndim == 2
+    values = values.reshape(-1, observation_dim)
+    return_to_go = np.asarray(observation["return_to_go"], dtype=np.float32).reshape(len(values))
+    timestep = np.asarray(observation["timestep"], dtype=np.int64).reshape(len(values))
+    return (values, return_to_go, timestep), vectorized

@@ -11,7 +11,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_dtfm.context import Context, empty_context, push, with_action
+from sb3_dtfm.context import Context, empty_context, push, unpack_observation, with_action
 from sb3_dtfm.networks.flow import check_solver
 from sb3_dtfm.networks.heads import FlowHead, RegressionHead
 from sb3_dtfm.networks.trunk import SequenceTrunk
@@ -68,6 +68,11 @@ class SequencePolicy(BasePolicy):
 
     observation_space: spaces.Dict
     action_space: spaces.Box
+    observation_mean: th.Tensor
+    observation_std: th.Tensor
+    return_scale: th.Tensor
+    action_low: th.Tensor
+    action_high: th.Tensor
 
     def __init__(
         self,
@@ -103,9 +108,7 @@ class SequencePolicy(BasePolicy):
         self.register_buffer("action_high", th.as_tensor(action_space.high), persistent=False)
         self._context: Context | None = None
 
-        trunk = SequenceTrunk(
-            self.observation_dim, self.action_dim, max_timestep, embed_dim, n_layers, n_heads, dropout
-        )
+        trunk = SequenceTrunk(self.observation_dim, self.action_dim, max_timestep, embed_dim, n_layers, n_heads, dropout)
         self.network = SequenceNetwork(trunk, self._make_head(), self._make_auxiliary_head())
         self.ema_network = copy.deepcopy(self.network).requires_grad_(False) if ema else None
         self.optimizer = self._make_optimizer(lr_schedule(1.0))
@@ -210,9 +213,9 @@ class SequencePolicy(BasePolicy):
 
         :param decay: share of the old average that stays
         """
-        averaged, trained = list(self.acting_network.parameters()), list(self.network.parameters())
-        with th.no_grad():
-            th._foreach_lerp_(averaged, trained, 1.0 - decay)
+        averaged = tuple(parameter.data for parameter in self.acting_network.parameters())
+        trained = tuple(parameter.data for parameter in self.network.parameters())
+        th._foreach_lerp_(averaged, trained, 1.0 - decay)
 
     def predict(
         self,
@@ -235,7 +238,7 @@ class SequencePolicy(BasePolicy):
         :return: actions (A,) or (B, A) in the environment's range, and the next state
         :raises ValueError: not the observation of a `ReturnToGoWrapper`, or a state of another number of environments
         """
-        arrays, vectorized = self._check_observation(observation)
+        arrays, vectorized = unpack_observation(observation, self.observation_dim)
         n_rows = len(arrays[0])
         if state is not None:
             context = Context(*state)
@@ -252,26 +255,6 @@ class SequencePolicy(BasePolicy):
             self._context = context
         action = np.clip(self.unscale_action(scaled_action), self.action_space.low, self.action_space.high)
         return action if vectorized else action.squeeze(axis=0), tuple(context)
-
-    def _check_observation(self, observation: Any) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], bool]:
-        """Observation (B, O), return-to-go (B,) and time step (B,) as arrays, and whether B was there."""
-        if not isinstance(observation, dict) or not set(self.observation_space.spaces) <= set(observation):
-            found = f"the keys {sorted(observation)}" if isinstance(observation, dict) else type(observation).__name__
-            raise ValueError(
-                f"The observation must be a dict with the keys {sorted(self.observation_space.spaces)}, as "
-                f"sb3_dtfm.envs.ReturnToGoWrapper gives it; got {found}."
-            )
-        values = np.asarray(observation["observation"], dtype=np.float32)
-        if values.ndim not in (1, 2) or values.shape[-1] != self.observation_dim:
-            raise ValueError(
-                f"observation['observation'] has shape {values.shape}; "
-                f"({self.observation_dim},) or (n_envs, {self.observation_dim}) is expected."
-            )
-        vectorized = values.ndim == 2
-        values = values.reshape(-1, self.observation_dim)
-        return_to_go = np.asarray(observation["return_to_go"], dtype=np.float32).reshape(len(values))
-        timestep = np.asarray(observation["timestep"], dtype=np.int64).reshape(len(values))
-        return (values, return_to_go, timestep), vectorized
 
     def _act(self, context: Context, deterministic: bool) -> np.ndarray:
         """The newest step's actions, (B, A) in [-1, 1]."""
@@ -293,7 +276,8 @@ class SequencePolicy(BasePolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """Actions (B, A) in the environment's range for single steps without a past."""
         assert isinstance(observation, dict)
-        arrays, _ = self._check_observation({key: value.cpu().numpy() for key, value in observation.items()})
+        numbers = {key: value.cpu().numpy() for key, value in observation.items()}
+        arrays, _ = unpack_observation(numbers, self.observation_dim)
         context = empty_context(len(arrays[0]), self.context_length, self.observation_dim, self.action_dim)
         action = self.unscale_action(self._act(push(context, *arrays), deterministic))
         return th.as_tensor(action, device=self.device)
@@ -302,7 +286,17 @@ class SequencePolicy(BasePolicy):
         return self._predict(observation, deterministic)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        names = ("context_length", "max_timestep", "embed_dim", "n_layers", "n_heads", "dropout", "weight_decay", "ema", "seed")
+        names = (
+            "context_length",
+            "max_timestep",
+            "embed_dim",
+            "n_layers",
+            "n_heads",
+            "dropout",
+            "weight_decay",
+            "ema",
+            "seed",
+        )
         return dict(
             observation_space=self.observation_space,
             action_space=self.action_space,
@@ -317,13 +311,19 @@ class DTPolicy(SequencePolicy):
     def _make_head(self) -> RegressionHead:
         return RegressionHead(self.embed_dim, self.action_dim)
 
+    @staticmethod
+    def _head(network: SequenceNetwork) -> RegressionHead:
+        assert isinstance(network.head, RegressionHead)
+        return network.head
+
     def compute_loss(self, batch: Any, generator: th.Generator) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         windows = self.scaled_windows(batch)
-        loss = self.network.head.loss(self.hidden_states(self.network, windows), windows.actions, windows.mask)
+        hidden = self.hidden_states(self.network, windows)
+        loss = self._head(self.network).loss(hidden, windows.actions, windows.mask)
         return loss, {"regression_loss": loss}
 
     def _generate(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
-        return self.acting_network.head(hidden)
+        return self._head(self.acting_network)(hidden)
 
 
 class DTFMPolicy(SequencePolicy):
@@ -342,6 +342,8 @@ class DTFMPolicy(SequencePolicy):
     The other parameters are those of :class:`SequencePolicy`.
     """
 
+    noise_table: th.Tensor
+
     def __init__(
         self,
         *args: Any,
@@ -352,13 +354,10 @@ class DTFMPolicy(SequencePolicy):
         regression_coef: float = 0.0,
         **kwargs: Any,
     ) -> None:
-        self._flow_parameters = dict(
-            flow_hidden_dim=flow_hidden_dim,
-            flow_n_layers=flow_n_layers,
-            solver=solver,
-            n_solver_steps=n_solver_steps,
-            regression_coef=regression_coef,
-        )
+        self.flow_hidden_dim = flow_hidden_dim
+        self.flow_n_layers = flow_n_layers
+        self.solver = solver
+        self.n_solver_steps = n_solver_steps
         self.regression_coef = regression_coef
         super().__init__(*args, **kwargs)
         noise_generator = th.Generator().manual_seed(0 if self.seed is None else self.seed)
@@ -366,15 +365,13 @@ class DTFMPolicy(SequencePolicy):
         self._acting_generator: th.Generator | None = None
 
     def _make_head(self) -> FlowHead:
-        parameters: dict[str, Any] = self._flow_parameters
-        return FlowHead(
-            self.embed_dim,
-            self.action_dim,
-            parameters["flow_hidden_dim"],
-            parameters["flow_n_layers"],
-            parameters["solver"],
-            parameters["n_solver_steps"],
-        )
+        check_solver(self.solver, self.n_solver_steps)
+        return FlowHead(self.embed_dim, self.action_dim, self.flow_hidden_dim, self.flow_n_layers)
+
+    @staticmethod
+    def _head(network: SequenceNetwork) -> FlowHead:
+        assert isinstance(network.head, FlowHead)
+        return network.head
 
     def _make_auxiliary_head(self) -> RegressionHead | None:
         return RegressionHead(self.embed_dim, self.action_dim) if self.regression_coef > 0 else None
@@ -384,7 +381,7 @@ class DTFMPolicy(SequencePolicy):
         hidden = self.hidden_states(self.network, windows)
         noise = th.randn(windows.actions.shape, generator=generator, device=hidden.device)
         tau = th.rand(windows.mask.shape, generator=generator, device=hidden.device)
-        flow_loss = self.network.head.loss(hidden, windows.actions, windows.mask, noise, tau)
+        flow_loss = self._head(self.network).loss(hidden, windows.actions, windows.mask, noise, tau)
         if self.network.auxiliary_head is None:
             return flow_loss, {"flow_loss": flow_loss}
         regression_loss = self.network.auxiliary_head.loss(hidden, windows.actions, windows.mask)
@@ -392,7 +389,7 @@ class DTFMPolicy(SequencePolicy):
         return loss, {"flow_loss": flow_loss, "regression_loss": regression_loss}
 
     def _generate(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
-        return self.acting_network.head(hidden, noise)
+        return self._head(self.acting_network)(hidden, noise, self.solver, self.n_solver_steps)
 
     def set_solver(self, solver: str, n_solver_steps: int) -> None:
         """
@@ -403,9 +400,8 @@ class DTFMPolicy(SequencePolicy):
         :raises ValueError: unknown solver, or fewer than one step
         """
         check_solver(solver, n_solver_steps)
-        self._flow_parameters.update(solver=solver, n_solver_steps=n_solver_steps)
-        for head in {self.network.head, self.acting_network.head}:
-            head.solver, head.n_solver_steps = solver, n_solver_steps
+        self.solver = solver
+        self.n_solver_steps = n_solver_steps
 
     def _acting_noise(self, timestep: th.Tensor, deterministic: bool) -> th.Tensor:
         if deterministic:
@@ -419,7 +415,8 @@ class DTFMPolicy(SequencePolicy):
         return _standard_normal(len(timestep), self.action_dim, self._acting_generator)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), **self._flow_parameters}
+        names = ("flow_hidden_dim", "flow_n_layers", "solver", "n_solver_steps", "regression_coef")
+        return {**super()._get_constructor_parameters(), **{name: getattr(self, name) for name in names}}
 
 
 def _standard_normal(n_rows: int, dim: int, generator: th.Generator) -> th.Tensor:

@@ -42,7 +42,9 @@ def record_random_episodes(n_episodes: int, seed: int = 0) -> list[Trajectory]:
             observation, reward, _, truncated, _ = env.step(action)
             rewards.append(reward)
         trajectories.append(
-            Trajectory(np.array(observations), np.array(actions), np.array(rewards), truncated=True, name=f"episode {episode}")
+            Trajectory(
+                np.array(observations), np.array(actions), np.array(rewards), truncated=True, name=f"episode {episode}"
+            )
         )
     return trajectories
 

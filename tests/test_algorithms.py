@@ -86,7 +86,8 @@ def test_training_continues_after_load_with_the_optimisers_state(algorithm, chee
     straight.save(tmp_path / "model")
     straight.learn(10, reset_num_timesteps=False)
     loaded = algorithm.load(tmp_path / "model", dataset=cheetah_buffer)
-    assert isinstance(loaded, BaseAlgorithm) and loaded.num_timesteps == 10
+    assert isinstance(loaded, BaseAlgorithm)
+    assert loaded.num_timesteps == 10
     loaded.learn(10, reset_num_timesteps=False)
     assert loaded.num_timesteps == 20
     assert th.equal(weights(loaded), weights(straight))
@@ -96,7 +97,8 @@ def test_the_saved_file_holds_no_data(cheetah_buffer, tmp_path):
     model = make_model(DT, cheetah_buffer)
     model.save(tmp_path / "model")
     loaded = DT.load(tmp_path / "model")
-    assert loaded.buffer is None and loaded.dataset is None
+    assert loaded.buffer is None
+    assert loaded.dataset is None
     with pytest.raises(ValueError, match=r"no dataset to learn from.*DT\.load\(path, dataset="):
         loaded.learn(1)
     loaded.set_dataset(cheetah_buffer)
@@ -119,7 +121,7 @@ def test_the_seed_decides_everything(cheetah_buffer):
 
 def test_both_algorithms_start_from_the_same_trunk_and_learn_from_the_same_half(cheetah_buffer):
     dt, dtfm = (make_model(algorithm, cheetah_buffer, dataset_fraction=0.5, seed=1) for algorithm in (DT, DTFM))
-    for ours, theirs in zip(dt.policy.network.trunk.parameters(), dtfm.policy.network.trunk.parameters()):
+    for ours, theirs in zip(dt.policy.network.trunk.parameters(), dtfm.policy.network.trunk.parameters(), strict=True):
         assert th.equal(ours, theirs)
     assert dt.buffer.n_episodes == dtfm.buffer.n_episodes == 3
     assert th.equal(dt.buffer.observations, dtfm.buffer.observations)
@@ -182,17 +184,9 @@ def test_tensorboard_holds_the_promised_curves(cheetah_buffer, tmp_path):
 
 
 def logged_learning_rates(model, n_steps):
-    class Record(BaseCallback):
-        rates: list[float] = []
-
-        def _on_step(self):
-            self.rates.append(self.model.policy.optimizer.param_groups[0]["lr"])
-            return True
-
-    callback = Record()
-    callback.rates = []
-    model.learn(n_steps, callback=callback)
-    return callback.rates
+    rates = []
+    model.learn(n_steps, callback=lambda *_: rates.append(model.policy.optimizer.param_groups[0]["lr"]) is None)
+    return rates
 
 
 def test_learning_rate_warms_up_and_decays(cheetah_buffer):
@@ -210,7 +204,8 @@ def test_learning_rate_warms_up_and_decays(cheetah_buffer):
 def test_the_moving_average_acts_and_follows_the_weights(cheetah_buffer):
     model = make_model(DT, cheetah_buffer, ema_decay=0.999).learn(1)
     trained, averaged = (next(net.parameters()) for net in (model.policy.network, model.policy.acting_network))
-    assert trained is not averaged and not averaged.requires_grad
+    assert trained is not averaged
+    assert not averaged.requires_grad
     before, target = averaged.clone(), trained.detach().clone()
     model.policy.update_ema(0.75)
     assert th.allclose(averaged, 0.75 * before + 0.25 * target)
@@ -247,7 +242,7 @@ def test_a_loss_that_is_no_longer_finite_stops_training_with_advice(cheetah_buff
     model = make_model(DT, cheetah_buffer)
     with th.no_grad():
         model.policy.network.trunk.final_norm.weight.fill_(float("nan"))
-    with pytest.raises(FloatingPointError, match="loss became nan.*learning_rate"):
+    with pytest.raises(FloatingPointError, match=r"loss became nan.*learning_rate"):
         model.learn(3)
 
 
@@ -259,7 +254,7 @@ def test_an_env_without_return_to_go_is_refused(cheetah_buffer):
 def test_observation_normalisation_and_frame_stacking_are_refused(cheetah_buffer):
     with pytest.raises(ValueError, match=r"VecNormalize\(norm_obs=True\)"):
         make_model(DT, cheetah_buffer, env=VecNormalize(DummyVecEnv([make_env])))
-    with pytest.raises(ValueError, match="VecFrameStack.*context_length"):
+    with pytest.raises(ValueError, match=r"VecFrameStack.*context_length"):
         make_model(DT, cheetah_buffer, env=VecFrameStack(DummyVecEnv([make_env]), 2))
     make_model(DT, cheetah_buffer, env=VecNormalize(DummyVecEnv([make_env]), norm_obs=False))
 
@@ -277,7 +272,13 @@ def test_a_dataset_that_does_not_fit_the_env_names_both(cheetah_buffer):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("precision", "float8"), ("learning_rate_schedule", "step"), ("batch_size", 0), ("ema_decay", 1.0), ("dataset_fraction", 0)],
+    [
+        ("precision", "float8"),
+        ("learning_rate_schedule", "step"),
+        ("batch_size", 0),
+        ("ema_decay", 1.0),
+        ("dataset_fraction", 0),
+    ],
 )
 def test_arguments_out_of_range_are_refused_by_name(name, value, cheetah_buffer):
     with pytest.raises(ValueError, match=f"{name}.*{value}"):

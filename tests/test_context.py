@@ -42,4 +42,4 @@ def test_pushing_leaves_the_old_context_alone():
     old = push(empty_context(1, 3, 2, 1), *step(1.0, 0))
     copies = [array.copy() for array in old]
     with_action(push(old, *step(2.0, 1)), np.ones((1, 1), np.float32))
-    assert all(np.array_equal(array, copy) for array, copy in zip(old, copies))
+    assert all(np.array_equal(array, copy) for array, copy in zip(old, copies, strict=True))

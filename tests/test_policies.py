@@ -75,7 +75,7 @@ def test_predict_with_state_is_a_pure_function(model):
     model.predict({**observation, "observation": observation["observation"] + 1}, deterministic=True)
     second, _ = model.predict(following, state=state, deterministic=True)
     assert np.array_equal(first, second)
-    assert all(np.array_equal(array, copy) for array, copy in zip(state, copies))
+    assert all(np.array_equal(array, copy) for array, copy in zip(state, copies, strict=True))
 
 
 def test_parallel_environments_act_as_they_would_alone(model):
@@ -107,7 +107,8 @@ def test_parallel_environments_act_as_they_would_alone(model):
 def test_actions_lie_in_the_environments_range_with_its_shape(model):
     observation, _ = make_env().reset(seed=0)
     action, _ = model.predict(observation)
-    assert action.shape == (6,) and model.action_space.contains(action)
+    assert action.shape == (6,)
+    assert model.action_space.contains(action)
     batch = {key: np.stack([value] * 3) for key, value in observation.items()}
     actions, state = model.predict(batch)
     assert actions.shape == (3, 6)
@@ -121,7 +122,8 @@ def test_fresh_noise_differs_and_deterministic_noise_is_not_zero(cheetah_buffer)
     assert not np.allclose(*drawn)
     timesteps = th.tensor([0, 1, 7])
     noise = model.policy._acting_noise(timesteps, deterministic=True)
-    assert noise.abs().min() > 0 and not th.allclose(noise[0], noise[1])
+    assert noise.abs().min() > 0
+    assert not th.allclose(noise[0], noise[1])
     assert th.equal(noise, model.policy._acting_noise(timesteps, deterministic=True))
 
 
@@ -134,7 +136,8 @@ def test_normalisation_is_the_datasets(model, cheetah_buffer):
 
 def test_weight_decay_spares_biases_norms_and_embeddings(model):
     decayed, spared = model.policy.optimizer.param_groups
-    assert decayed["weight_decay"] == 1e-3 and spared["weight_decay"] == 0.0
+    assert decayed["weight_decay"] == 1e-3
+    assert spared["weight_decay"] == 0.0
     names = {id(parameter): name for name, parameter in model.policy.network.named_parameters()}
     assert all("weight" in names[id(p)] and "norm" not in names[id(p)] for p in decayed["params"])
     assert all("bias" in names[id(p)] or "norm" in names[id(p)] or "timestep" in names[id(p)] for p in spared["params"])

@@ -1,4 +1,4 @@
-"""Recorded episodes in memory: one `Trajectory` each, all of them flat in a `TrajectoryBuffer` that is sampled in windows."""
+"""Recorded episodes in memory: a `Trajectory` each, and all of them flat in a `TrajectoryBuffer`, sampled in windows."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -283,9 +283,7 @@ class TrajectoryBuffer:
         )
 
 
-def check_trajectory(
-    trajectory: Trajectory, observation_space: spaces.Box, action_space: spaces.Box, source: str
-) -> None:
+def check_trajectory(trajectory: Trajectory, observation_space: spaces.Box, action_space: spaces.Box, source: str) -> None:
     """
     Refuse an episode that training must not see.
 
@@ -308,7 +306,9 @@ def check_trajectory(
         if bad.any():
             index = tuple(int(i) for i in np.argwhere(bad)[0])
             column = f", dimension {index[1]}" if len(index) > 1 else ""
-            raise DatasetError(f"{where}, step {index[0]}: {name} hold {array[index]}{column}; numbers must be finite in float32.")
+            raise DatasetError(
+                f"{where}, step {index[0]}: {name} hold {array[index]}{column}; numbers must be finite in float32."
+            )
     slack = ACTION_TOLERANCE * (action_space.high - action_space.low)
     outside = (trajectory.actions < action_space.low - slack) | (trajectory.actions > action_space.high + slack)
     if outside.any():

@@ -82,7 +82,7 @@ class VectorField(nn.Module):
         :return: velocity, (..., A)
         """
         film = condition + self.film_time(sinusoidal_embedding(tau, self.time_embedding_dim))
-        for layer, layer_film in zip(self.layers, film.chunk(self.n_layers, dim=-1)):
+        for layer, layer_film in zip(self.layers, film.chunk(self.n_layers, dim=-1), strict=True):
             scale, shift = layer_film.chunk(2, dim=-1)
             x = F.silu(layer(x) * (1.0 + scale) + shift)
         return self.output(x)

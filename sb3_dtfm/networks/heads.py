@@ -3,7 +3,7 @@
 import torch as th
 from torch import nn
 
-from sb3_dtfm.networks.flow import VectorField, check_solver, integrate, interpolate
+from sb3_dtfm.networks.flow import VectorField, integrate, interpolate
 
 
 def masked_mean(values: th.Tensor, mask: th.Tensor) -> th.Tensor:
@@ -51,28 +51,13 @@ class FlowHead(nn.Module):
     :param action_dim: A
     :param hidden_dim: width of the vector field's hidden layers
     :param n_layers: number of hidden layers of the vector field
-    :param solver: ODE solver, a key of `sb3_dtfm.networks.flow.SOLVERS`
-    :param n_solver_steps: number of its steps
     """
 
-    def __init__(
-        self,
-        embed_dim: int,
-        action_dim: int,
-        hidden_dim: int = 512,
-        n_layers: int = 3,
-        solver: str = "euler",
-        n_solver_steps: int = 50,
-    ) -> None:
+    def __init__(self, embed_dim: int, action_dim: int, hidden_dim: int = 512, n_layers: int = 3) -> None:
         super().__init__()
-        check_solver(solver, n_solver_steps)
         self.vector_field = VectorField(action_dim, embed_dim, hidden_dim, n_layers)
-        self.solver = solver
-        self.n_solver_steps = n_solver_steps
 
-    def loss(
-        self, hidden: th.Tensor, actions: th.Tensor, mask: th.Tensor, noise: th.Tensor, tau: th.Tensor
-    ) -> th.Tensor:
+    def loss(self, hidden: th.Tensor, actions: th.Tensor, mask: th.Tensor, noise: th.Tensor, tau: th.Tensor) -> th.Tensor:
         """
         Conditional flow matching (Lipman et al., 2023): squared error of the velocity on the path from noise to action.
 
@@ -87,12 +72,14 @@ class FlowHead(nn.Module):
         predicted = self.vector_field(x, tau, self.vector_field.condition(hidden))
         return masked_mean((predicted - velocity).square(), mask)
 
-    def forward(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
+    def forward(self, hidden: th.Tensor, noise: th.Tensor, solver: str = "euler", n_solver_steps: int = 50) -> th.Tensor:
         """
         Carry noise to actions.
 
         :param hidden: (B, D)
         :param noise: (B, A), standard normal
+        :param solver: ODE solver, a key of `sb3_dtfm.networks.flow.SOLVERS`
+        :param n_solver_steps: number of its steps
         :return: (B, A), in [-1, 1] as far as the field learned it; the policy clips
         """
         condition = self.vector_field.condition(hidden)
@@ -100,4 +87,4 @@ class FlowHead(nn.Module):
         def field(x: th.Tensor, tau: float) -> th.Tensor:
             return self.vector_field(x, th.full((), tau, device=x.device), condition)
 
-        return integrate(field, noise, self.solver, self.n_solver_steps)
+        return integrate(field, noise, solver, n_solver_steps)

@@ -16,7 +16,8 @@ class TransformerBlock(nn.Module):
         self.attention_in = nn.Linear(embed_dim, 3 * embed_dim)
         self.attention_out = nn.Linear(embed_dim, embed_dim)
         self.mlp_norm = nn.LayerNorm(embed_dim)
-        self.mlp = nn.Sequential(nn.Linear(embed_dim, 4 * embed_dim), nn.GELU(), nn.Linear(4 * embed_dim, embed_dim))
+        self.mlp_in = nn.Linear(embed_dim, 4 * embed_dim)
+        self.mlp_out = nn.Linear(4 * embed_dim, embed_dim)
         self.residual_dropout = nn.Dropout(dropout)
 
     def forward(self, tokens: th.Tensor, attention_mask: th.Tensor) -> th.Tensor:
@@ -26,7 +27,7 @@ class TransformerBlock(nn.Module):
         :return: (B, L, D)
         """
         tokens = tokens + self.residual_dropout(self._attend(self.attention_norm(tokens), attention_mask))
-        return tokens + self.residual_dropout(self.mlp(self.mlp_norm(tokens)))
+        return tokens + self.residual_dropout(self.mlp_out(F.gelu(self.mlp_in(self.mlp_norm(tokens)))))
 
     def _attend(self, tokens: th.Tensor, attention_mask: th.Tensor) -> th.Tensor:
         batch, length, width = tokens.shape
@@ -86,7 +87,7 @@ class SequenceTrunk(nn.Module):
         if isinstance(module, nn.Linear):
             nn.init.zeros_(module.bias)
         if isinstance(module, TransformerBlock):
-            for branch_end in (module.attention_out, module.mlp[-1]):
+            for branch_end in (module.attention_out, module.mlp_out):
                 nn.init.normal_(branch_end.weight, std=0.02 / (2 * self.n_layers) ** 0.5)
 
     def forward(

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import os
 import time
 import zipfile
 from collections.abc import Sequence
@@ -24,6 +23,7 @@ ENV_NAME = ENV_ID.replace("/", "-")  # RL-Zoo's spelling in folders
 N_DEMONSTRATIONS = 200
 DATASET_FRACTION = 0.5
 TRAINING_SEED = 0
+N_EVALUATION_ENVS = 4  # part of the result: each environment has a seed of its own
 EVALUATION_SEED = 10_000  # far from the training evaluations', which count up from TRAINING_SEED
 
 
@@ -101,7 +101,7 @@ def train_if_missing(folder: Path, dataset: Path, n_steps: int | None) -> Path:
         return finished[-1]
     arguments = ["--algo", "dtfm", "--env", ENV_ID, "--conf-file", "small"]
     arguments += ["--dataset", str(dataset), "--dataset-fraction", str(DATASET_FRACTION)]
-    arguments += ["--eval-freq", "500", "--eval-episodes", "10"]
+    arguments += ["--eval-freq", "500", "--eval-episodes", "10", "--n-eval-envs", "5"]
     arguments += ["--log-folder", str(folder / "logs"), "--tensorboard-log", str(folder / "tensorboard")]
     arguments += ["--seed", str(TRAINING_SEED), "--verbose", "0", "--progress", "--log-interval", "50"]
     if n_steps is not None:
@@ -126,7 +126,7 @@ def evaluate_if_missing(run_folder: Path, n_episodes: int) -> dict[str, Any]:
     hyperparams, _ = get_saved_hyperparams(str(run_folder / ENV_NAME))
     env = create_test_env(
         ENV_ID,
-        n_envs=min(os.cpu_count() or 1, 4, n_episodes),
+        n_envs=min(N_EVALUATION_ENVS, n_episodes),
         seed=EVALUATION_SEED,
         should_render=False,
         hyperparams=hyperparams,

@@ -6,20 +6,20 @@ import torch as th
 from sb3_dtfm.networks.heads import RegressionHead, masked_mean
 from sb3_dtfm.networks.trunk import SequenceTrunk, causal_mask
 
-B, K, O, A = 3, 6, 5, 2
+B, K, OBSERVATION_DIM, A = 3, 6, 5, 2
 
 
 @pytest.fixture
 def trunk() -> SequenceTrunk:
     th.manual_seed(0)
-    return SequenceTrunk(O, A, max_timestep=50, embed_dim=16, n_layers=2, n_heads=2, dropout=0.0)
+    return SequenceTrunk(OBSERVATION_DIM, A, max_timestep=50, embed_dim=16, n_layers=2, n_heads=2, dropout=0.0)
 
 
 @pytest.fixture
 def window() -> dict[str, th.Tensor]:
     generator = th.Generator().manual_seed(1)
     return dict(
-        observations=th.randn(B, K, O, generator=generator),
+        observations=th.randn(B, K, OBSERVATION_DIM, generator=generator),
         actions=th.rand(B, K, A, generator=generator),
         returns_to_go=th.randn(B, K, generator=generator),
         timesteps=th.arange(K).repeat(B, 1),
@@ -91,4 +91,4 @@ def test_regression_actions_stay_within_their_bounds():
 
 def test_width_must_be_a_multiple_of_the_heads():
     with pytest.raises(ValueError, match="embed_dim=30 and n_heads=4"):
-        SequenceTrunk(O, A, 10, embed_dim=30, n_heads=4)
+        SequenceTrunk(OBSERVATION_DIM, A, 10, embed_dim=30, n_heads=4)

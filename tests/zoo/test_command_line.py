@@ -18,7 +18,9 @@ def train(algo: str, *arguments: str) -> int:
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_train_writes_what_enjoy_reads(algo, workplace, capsys):
-    assert train(algo, "--conf-file", "small", "--eval-freq", "2", "--eval-episodes", "1", "--save-freq", "3", "-tb", "tb") == 0
+    assert (
+        train(algo, "--conf-file", "small", "--eval-freq", "2", "--eval-episodes", "1", "--save-freq", "3", "-tb", "tb") == 0
+    )
     run = workplace / "logs" / algo / "HalfCheetah-v5_1"
     names = {"HalfCheetah-v5.zip", "best_model.zip", "evaluations.npz", "rl_model_3_steps.zip"}
     assert names <= {path.name for path in run.iterdir()}
@@ -62,7 +64,16 @@ def test_rl_zoos_own_algorithms_still_train(workplace):
 
 
 def test_hyperparameters_can_be_searched(workplace, capsys):
-    search = ["--optimize-hyperparameters", "--n-trials", "1", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots"]
+    search = [
+        "--optimize-hyperparameters",
+        "--n-trials",
+        "1",
+        "--n-evaluations",
+        "1",
+        "--eval-episodes",
+        "1",
+        "--no-optim-plots",
+    ]
     assert train("dtfm", *search) == 0
     assert "Best trial:" in capsys.readouterr().out
 
@@ -71,7 +82,10 @@ def test_hyperparameters_can_be_searched(workplace, capsys):
     ("arguments", "message"),
     [
         (tiny_training("dtfm", "--dataset", "no/such/file.hdf5"), "no/such/file.hdf5"),
-        (tiny_training("dtfm", "--dataset", DATASET_ID, "--dataset-fraction", "2"), "dataset_fraction must lie in (0, 1], got 2"),
+        (
+            tiny_training("dtfm", "--dataset", DATASET_ID, "--dataset-fraction", "2"),
+            "dataset_fraction must lie in (0, 1], got 2",
+        ),
         (tiny_training("dtfm", "--dataset", DATASET_ID, "--conf-file", "absent.yml"), "absent.yml: No such file"),
         (["train", "--algo", "dtfm", "--env", "HalfCheeta-v5"], "HalfCheetah-v5"),
         (["train", "--algo", "dtfm", "--env", "Pendulum-v1", "--dataset", DATASET_ID], "ReturnToGoWrapper"),
@@ -105,8 +119,14 @@ def test_an_error_in_the_midst_of_training_keeps_its_traceback(workplace, monkey
     [
         (["--algo", "sac"], "--model, --env, --dataset-id: required without --demonstrator"),
         (["--demonstrator", "lift"], "--output: required with --demonstrator lift"),
-        (["--demonstrator", "lift", "--output", "x", "--stochastic", "--noise", "1"], "--stochastic, --noise: not used with"),
-        (["--algo", "sac", "--model", "m", "--env", "E", "--dataset-id", "i", "--workers", "1"], "--workers: not used without"),
+        (
+            ["--demonstrator", "lift", "--output", "x", "--stochastic", "--noise", "1"],
+            "--stochastic, --noise: not used with",
+        ),
+        (
+            ["--algo", "sac", "--model", "m", "--env", "E", "--dataset-id", "i", "--workers", "1"],
+            "--workers: not used without",
+        ),
         (["--demonstrator", "door"], "invalid choice: 'door'"),
         (["--demonstrator", "lift", "--output", "x", "--episodes", "0"], "--episodes: must be at least 1, got 0"),
     ],
