@@ -12,7 +12,8 @@ TURN_SHARE = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])  # of the unsteadiness, pe
 
 OPEN, CLOSE = -1.0, 1.0
 OVERREACH = 0.012  # metres below the grasp point that the descent aims at, so that the hand does not creep the last bit
-MISJUDGEMENT_RATE = 0.1  # of episodes whose first grasp closes on air, which shows how to begin again
+GRASP_TOLERANCE = 0.015  # metres from the grasp point, horizontally: the opened fingers leave 0.019 beside a cube
+MISJUDGEMENT_RATE = 0.07  # of episodes whose first grasp closes on air, which shows how to begin again
 FINGERS_OPEN = 0.03  # metres from the middle
 FINGERS_STILL = 4e-4  # metres per step
 DOWNWARD = np.array([1.0, 0.0, 0.0, 0.0])  # hand pointing down, as x y z w
@@ -33,7 +34,7 @@ class Manner:
     :param hover_tolerance: horizontal distance at which the descent starts, metres
     :param hover_offset: (2,) where the hover point lies beside the object, metres
     :param grasp_offset: (3,) of the grasp point from the object's centre, metres
-    :param grasp_tolerance: distance from the grasp point at which the fingers close, metres
+    :param grasp_height_tolerance: height above the grasp point at which the fingers close, metres
     :param dwell: steps between fingers at rest and the lift
     :param lift_drift: (2,) sideways share of the lift's direction
     :param carry_height: of the object above the walls, metres
@@ -51,7 +52,7 @@ class Manner:
     hover_tolerance: float
     hover_offset: np.ndarray
     grasp_offset: np.ndarray
-    grasp_tolerance: float
+    grasp_height_tolerance: float
     dwell: int
     lift_drift: np.ndarray
     carry_height: float
@@ -76,8 +77,8 @@ class Manner:
             hover_height=rng.uniform(0.05, 0.09),
             hover_tolerance=rng.uniform(0.015, 0.025),
             hover_offset=rng.normal(0.0, 0.006, 2),
-            grasp_offset=rng.normal(0.0, (0.003, 0.003, 0.003)),
-            grasp_tolerance=rng.uniform(0.007, 0.011),
+            grasp_offset=rng.normal(0.0, (0.005, 0.005, 0.003)),
+            grasp_height_tolerance=rng.uniform(0.006, 0.01),
             dwell=int(rng.integers(0, 3)),
             lift_drift=rng.normal(0.0, 0.1, 2),
             carry_height=rng.uniform(0.01, 0.05),
@@ -149,7 +150,7 @@ class Demonstrator:
         if self.stage == "descend":
             if aside > 0.04:
                 return "hover"
-            if aside < manner.grasp_tolerance and -to_grasp[2] < manner.grasp_tolerance:
+            if aside < GRASP_TOLERANCE and -to_grasp[2] < manner.grasp_height_tolerance:
                 return "grasp"
         if self.stage == "grasp" and self._steps_in_stage >= 3 + manner.dwell and finger_speed < FINGERS_STILL:
             self._misjudged_height = 0.0
