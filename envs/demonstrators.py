@@ -72,7 +72,7 @@ class Manner:
         """
         return cls(
             speed=rng.uniform(*speed_range),
-            time_constant=rng.uniform(0.14, 0.24),
+            time_constant=rng.uniform(0.18, 0.32),
             agility=rng.uniform(0.2, 0.4),
             hover_height=rng.uniform(0.05, 0.09),
             hover_tolerance=rng.uniform(0.015, 0.025),
@@ -103,7 +103,7 @@ class Demonstrator:
     smallest_grip = 0.012  # metres from the middle to a finger: closed further, it holds nothing
     grasp_height = 0.0  # metres above the object's centre
     misjudgement = 0.04  # metres too high where a first grasp goes wrong
-    speed_range = (0.55, 0.95)
+    speed_range = (0.35, 0.7)
     free_stages = ("hover", "descend")  # where a jerk does no harm
 
     def __init__(self, seed: int | np.random.SeedSequence | None = None) -> None:

@@ -29,12 +29,18 @@ def train(argv: Sequence[str]) -> None:
 def enjoy(argv: Sequence[str]) -> None:
     """RL-Zoo's `enjoy`, with dt and dtfm."""
     from rl_zoo3.enjoy import enjoy as zoo_enjoy
+    from rl_zoo3.utils import get_model_path
 
     from sb3_dtfm.zoo.arguments import enjoy_arguments
     from sb3_dtfm.zoo.registration import register
 
     register()
-    _run_with_arguments(zoo_enjoy, "enjoy", enjoy_arguments(argv))
+    try:
+        _run_with_arguments(zoo_enjoy, "enjoy", enjoy_arguments(argv))
+    except (AssertionError, ValueError) as error:
+        if not _raised_inside(error, get_model_path.__code__):
+            raise
+        raise FileNotFoundError(f"{error}. -f names the folder that train wrote to, --exp-id the run in it.") from error
 
 
 def record(argv: Sequence[str]) -> None:

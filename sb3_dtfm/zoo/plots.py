@@ -18,7 +18,7 @@ class Evaluations(NamedTuple):
     """
     What evaluations of n episodes each found at E gradient steps.
 
-    Shapes: steps (E,), returns (E, n) in environment reward units, successes (E, n) bool or None where a task has no success.
+    Shapes: steps (E,), returns (E, n) in environment reward units, successes (E, n) bool, None without such a notion.
     """
 
     steps: np.ndarray
