@@ -172,11 +172,11 @@ class SequencePolicy(BasePolicy):
             return super().scale_action(action)
         return 2.0 * (action - self.action_low) / (self.action_high - self.action_low) - 1.0
 
-    def hidden_states(self, network: SequenceNetwork, windows: SequenceTensors) -> th.Tensor:
+    def hidden_states(self, network: SequenceNetwork, windows: SequenceTensors, last_only: bool = False) -> th.Tensor:
         """
         Run the trunk on windows in environment units.
 
-        :return: (B, K, D)
+        :return: (B, K, D), or (B, 1, D) of the newest steps with `last_only`
         """
         normalized = (windows.observations - self.observation_mean) / self.observation_std
         return network.trunk(
@@ -185,6 +185,7 @@ class SequencePolicy(BasePolicy):
             windows.returns_to_go / self.return_scale,
             windows.timesteps,
             windows.mask,
+            last_only,
         )
 
     def scaled_windows(self, batch: Any) -> SequenceTensors:
@@ -203,7 +204,7 @@ class SequencePolicy(BasePolicy):
         self.set_training_mode(False)
         with th.no_grad():
             windows = self.scaled_windows(batch)
-            hidden = self.hidden_states(self.acting_network, windows)[:, -1]
+            hidden = self.hidden_states(self.acting_network, windows, last_only=True).squeeze(1)
             actions = self._generate(hidden, _standard_normal(len(hidden), self.action_dim, generator)).clamp(-1.0, 1.0)
             return (actions - windows.actions[:, -1]).square().mean()
 
@@ -261,7 +262,7 @@ class SequencePolicy(BasePolicy):
         self.set_training_mode(False)
         with th.inference_mode():
             windows = SequenceTensors(*(th.from_numpy(array).to(self.device) for array in context))
-            hidden = self.hidden_states(self.acting_network, windows)[:, -1]
+            hidden = self.hidden_states(self.acting_network, windows, last_only=True).squeeze(1)
             noise = self._acting_noise(windows.timesteps[:, -1], deterministic)
             return self._generate(hidden, noise).clamp(-1.0, 1.0).cpu().numpy()
 

@@ -4,6 +4,8 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
+ALL = slice(None)
+
 
 class TransformerBlock(nn.Module):
     """Pre-norm block: causal self-attention, then a four times wider GELU MLP, each on a residual path."""
@@ -20,23 +22,37 @@ class TransformerBlock(nn.Module):
         self.mlp_out = nn.Linear(4 * embed_dim, embed_dim)
         self.residual_dropout = nn.Dropout(dropout)
 
-    def forward(self, tokens: th.Tensor, attention_mask: th.Tensor) -> th.Tensor:
+    def forward(self, tokens: th.Tensor, attention_mask: th.Tensor, queries: slice = ALL) -> th.Tensor:
         """
         :param tokens: (B, L, D)
         :param attention_mask: (B, 1, L, L) bool, True where the query (third axis) may see the key (fourth)
-        :return: (B, L, D)
+        :param queries: the Q tokens to compute; nothing is spent on the others beyond their keys and values
+        :return: (B, Q, D)
         """
-        tokens = tokens + self.residual_dropout(self._attend(self.attention_norm(tokens), attention_mask))
+        attended = self._attend(self.attention_norm(tokens), attention_mask[:, :, queries], queries)
+        tokens = tokens[:, queries] + self.residual_dropout(attended)
         return tokens + self.residual_dropout(self.mlp_out(F.gelu(self.mlp_in(self.mlp_norm(tokens)))))
 
-    def _attend(self, tokens: th.Tensor, attention_mask: th.Tensor) -> th.Tensor:
-        batch, length, width = tokens.shape
-        heads = self.attention_in(tokens).view(batch, length, 3, self.n_heads, width // self.n_heads)
-        query, key, value = heads.permute(2, 0, 3, 1, 4)  # (B, heads, L, D / heads) each
+    def _attend(self, tokens: th.Tensor, attention_mask: th.Tensor, queries: slice) -> th.Tensor:
+        width = tokens.shape[-1]
+        if queries == ALL:
+            query, key, value = self.attention_in(tokens).split(width, dim=-1)
+        else:
+            weight, bias = self.attention_in.weight, self.attention_in.bias
+            query = F.linear(tokens[:, queries], weight[:width], bias[:width])
+            key, value = F.linear(tokens, weight[width:], bias[width:]).split(width, dim=-1)
         attended = F.scaled_dot_product_attention(
-            query, key, value, attn_mask=attention_mask, dropout_p=self.dropout if self.training else 0.0
+            self._split_heads(query),
+            self._split_heads(key),
+            self._split_heads(value),
+            attn_mask=attention_mask,
+            dropout_p=self.dropout if self.training else 0.0,
         )
-        return self.attention_out(attended.transpose(1, 2).reshape(batch, length, width))
+        return self.attention_out(attended.transpose(1, 2).flatten(start_dim=2))
+
+    def _split_heads(self, tokens: th.Tensor) -> th.Tensor:
+        """From (B, L, D) to (B, heads, L, D / heads)."""
+        return tokens.unflatten(-1, (self.n_heads, -1)).transpose(1, 2)
 
 
 class SequenceTrunk(nn.Module):
@@ -69,6 +85,8 @@ class SequenceTrunk(nn.Module):
         super().__init__()
         if embed_dim % n_heads:
             raise ValueError(f"embed_dim must be a multiple of n_heads, got embed_dim={embed_dim} and n_heads={n_heads}.")
+        if n_layers < 1:
+            raise ValueError(f"n_layers must be at least 1, got {n_layers}.")
         self.embed_dim = embed_dim
         self.n_layers = n_layers
         self.embed_return_to_go = nn.Linear(1, embed_dim)
@@ -97,6 +115,7 @@ class SequenceTrunk(nn.Module):
         returns_to_go: th.Tensor,
         timesteps: th.Tensor,
         mask: th.Tensor,
+        last_only: bool = False,
     ) -> th.Tensor:
         """
         :param observations: (B, K, O), normalised
@@ -104,7 +123,8 @@ class SequenceTrunk(nn.Module):
         :param returns_to_go: (B, K), scaled
         :param timesteps: (B, K) int64
         :param mask: (B, K) bool, False on padded steps
-        :return: (B, K, D) hidden states
+        :param last_only: compute the newest step's hidden state alone
+        :return: (B, K, D) hidden states, (B, 1, D) with `last_only`
         """
         batch, context_length = mask.shape
         time = self.embed_timestep(timesteps.clamp(max=self.embed_timestep.num_embeddings - 1))
@@ -118,9 +138,11 @@ class SequenceTrunk(nn.Module):
         ).view(batch, 3 * context_length, self.embed_dim)
         tokens = self.embedding_dropout(tokens[:, :-1])  # nothing attends to the last action
         attention_mask = causal_mask(mask.repeat_interleave(3, dim=1)[:, :-1])
-        for block in self.blocks:
+        *lower_blocks, last_block = self.blocks
+        for block in lower_blocks:
             tokens = block(tokens, attention_mask)
-        return self.final_norm(tokens[:, 1::3])
+        observation_tokens = slice(-1, None) if last_only else slice(1, None, 3)
+        return self.final_norm(last_block(tokens, attention_mask, observation_tokens))
 
 
 def causal_mask(valid: th.Tensor) -> th.Tensor:

@@ -92,3 +92,15 @@ def test_regression_actions_stay_within_their_bounds():
 def test_width_must_be_a_multiple_of_the_heads():
     with pytest.raises(ValueError, match="embed_dim=30 and n_heads=4"):
         SequenceTrunk(OBSERVATION_DIM, A, 10, embed_dim=30, n_heads=4)
+
+
+def test_the_last_hidden_state_alone_is_the_same(trunk, window):
+    window["mask"] = window["mask"].clone()
+    window["mask"][0, :3] = False
+    assert th.allclose(trunk(**window, last_only=True), trunk(**window)[:, -1:], atol=1e-6)
+
+
+def test_a_block_gives_each_query_what_it_gives_it_among_all(trunk, window):
+    block = trunk.blocks[0]
+    tokens, mask = th.randn(B, 7, 16), causal_mask(th.ones(B, 7, dtype=th.bool))
+    assert th.allclose(block(tokens, mask, slice(1, None, 3)), block(tokens, mask)[:, 1::3], atol=1e-6)
