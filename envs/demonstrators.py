@@ -11,6 +11,8 @@ RADIANS_PER_SECOND = 3.06
 TURN_SHARE = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.3])  # of the unsteadiness, per action dimension
 
 OPEN, CLOSE = -1.0, 1.0
+FUNNEL_RADIUS = 0.008  # metres aside of the grasp point within which the descent goes straight down
+FUNNEL_SLOPE = 2.0  # metres up for each metre further aside
 OVERREACH = 0.012  # metres below the grasp point that the descent aims at, so that the hand does not creep the last bit
 GRASP_TOLERANCE = 0.015  # metres from the grasp point, horizontally: the opened fingers leave 0.019 beside a cube
 MISJUDGEMENT_RATE = 0.07  # of episodes whose first grasp closes on air, which shows how to begin again
@@ -72,7 +74,7 @@ class Manner:
         """
         return cls(
             speed=rng.uniform(*speed_range),
-            time_constant=rng.uniform(0.18, 0.32),
+            time_constant=rng.uniform(0.15, 0.26),
             agility=rng.uniform(0.2, 0.4),
             hover_height=rng.uniform(0.05, 0.09),
             hover_tolerance=rng.uniform(0.015, 0.025),
@@ -83,7 +85,7 @@ class Manner:
             lift_drift=rng.normal(0.0, 0.1, 2),
             carry_height=rng.uniform(0.01, 0.05),
             release_offset=rng.normal(0.0, 0.01, 2),
-            release_tolerance=rng.uniform(0.025, 0.045),
+            release_tolerance=rng.uniform(0.035, 0.055),
             noise=rng.uniform(0.05, 0.13),
             noise_memory=rng.uniform(0.7, 0.9),
             jerk_rate=rng.uniform(0.0, 0.06),
@@ -162,13 +164,15 @@ class Demonstrator:
     def _target(self, hand: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, float]:
         """Where the hand should go, (3,) metres, and the gripper's command."""
         grasp_point = self._grasp_point(position)
+        aside = float(np.hypot(*(grasp_point - hand)[:2]))
         if self.stage == "hover":
             # Comes down on a slope, so that the hand arrives over the object and at hover height together.
-            aside = float(np.hypot(*(grasp_point - hand)[:2]))
             height = self.manner.hover_height + 0.5 * aside
             return grasp_point + np.array([*self.manner.hover_offset, height]), OPEN
         if self.stage == "descend":
-            return grasp_point - np.array([0.0, 0.0, OVERREACH]), OPEN
+            # Through a funnel: the further aside, the higher, so that the fingers come down beside the object, not on it.
+            height = FUNNEL_SLOPE * max(aside - FUNNEL_RADIUS, 0.0) - OVERREACH
+            return grasp_point + np.array([0.0, 0.0, height]), OPEN
         if self.stage == "grasp":
             return grasp_point, CLOSE
         return self._target_holding(hand, position)

@@ -29,7 +29,7 @@ def import_robosuite() -> ModuleType:
         return sys.modules["robosuite"]
     rendering_backend = os.environ.get("MUJOCO_GL")
     try:
-        with _silence():
+        with _silence(), _optional_opencv():
             import robosuite
     except ImportError as error:
         raise ImportError(
@@ -42,6 +42,21 @@ def import_robosuite() -> ModuleType:
         else:
             os.environ["MUJOCO_GL"] = rendering_backend
     return robosuite
+
+
+@contextmanager
+def _optional_opencv() -> Iterator[None]:
+    """Let robosuite's own viewer, which is not used here, import OpenCV in vain: without libGL it cannot be loaded."""
+    try:
+        import cv2  # noqa: F401
+    except ImportError:
+        sys.modules["cv2"] = ModuleType("cv2")
+        try:
+            yield
+        finally:
+            del sys.modules["cv2"]
+    else:
+        yield
 
 
 @contextmanager

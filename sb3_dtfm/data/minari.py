@@ -104,7 +104,7 @@ def score_reference(dataset: minari.MinariDataset) -> ScoreReference | None:
     minimum, maximum = metadata.get("ref_min_score"), metadata.get("ref_max_score")
     if minimum is None or maximum is None or not minimum < maximum:
         return None
-    scale = f"Minari scale of {dataset.id}: 0 = ref_min_score {minimum:.6g}, 1 = ref_max_score {maximum:.6g}"
+    scale = f"Minari's scale: ref_min_score and ref_max_score of {dataset.id}"
     return ScoreReference(float(minimum), float(maximum), scale)
 
 

@@ -2,6 +2,10 @@
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
+
+import gymnasium as gym
+import yaml
 
 from sb3_dtfm.zoo.registration import OFFLINE_ALGORITHMS, PACKAGED_CONFIGS, packaged_config
 
@@ -36,6 +40,7 @@ def train_parser() -> argparse.ArgumentParser:
     )
     shared = parser.add_argument_group("read on the way to RL-Zoo").add_argument
     shared("--algo", default="ppo", help=argparse.SUPPRESS)
+    shared("--env", default="CartPole-v1", help=argparse.SUPPRESS)
     shared("-params", "--hyperparams", nargs="+", action="extend", default=[], help=argparse.SUPPRESS)
     return parser
 
@@ -47,23 +52,39 @@ def train_arguments(argv: Sequence[str]) -> list[str]:
     The shorthands become hyperparameters. They are merged with the user's own, since RL-Zoo keeps only the last `-params`.
 
     :param argv: the user's arguments
-    :raises UsageError: a shorthand for an algorithm that knows no dataset
+    :raises UsageError: a shorthand for an algorithm that knows no dataset, or one that is missing
     """
     options, rest = train_parser().parse_known_args(argv)
     shorthands = _shorthands(options)
     if options.algo not in OFFLINE_ALGORITHMS and shorthands:
         names = ", ".join(option for option, _ in shorthands)
         raise UsageError(f"{names}: for --algo {' and '.join(OFFLINE_ALGORITHMS)} only, not for {options.algo}.")
+    hyperparams = [*options.hyperparams, *(value for _, value in shorthands)]
     conf_file = options.conf_file
     if options.algo in OFFLINE_ALGORITHMS and conf_file in PACKAGED_CONFIGS:
         conf_file = str(packaged_config(options.algo, conf_file))
-    arguments = ["--algo", options.algo, *rest]
+        _check_task(conf_file, options.env, hyperparams)
+    arguments = ["--algo", options.algo, "--env", options.env, *rest]
     if conf_file is not None:
         arguments += ["--conf-file", conf_file]
-    hyperparams = [*options.hyperparams, *(value for _, value in shorthands)]
     if hyperparams:
         arguments += ["--hyperparams", *hyperparams]
     return arguments
+
+
+def _check_task(conf_file: str, env_id: str, hyperparams: Sequence[str]) -> None:
+    """
+    Say what a task that the packaged settings do not list still needs.
+
+    :raises UsageError: no dataset or no target return
+    """
+    if env_id in yaml.safe_load(Path(conf_file).read_text()):
+        return
+    given = {hyperparam.split(":")[0] for hyperparam in hyperparams}
+    needed = {"dataset": "--dataset", "env_wrapper": "--target-return"}
+    missing = [option for key, option in needed.items() if key not in given]
+    if missing and env_id in gym.registry:
+        raise UsageError(f"{', '.join(missing)}: needed for {env_id}, which {conf_file} does not list.")
 
 
 def _shorthands(options: argparse.Namespace) -> list[tuple[str, str]]:

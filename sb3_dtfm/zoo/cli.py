@@ -2,7 +2,6 @@
 
 import argparse
 import importlib.util
-import os
 import sys
 from collections.abc import Callable, Sequence
 from types import CodeType
@@ -126,7 +125,7 @@ def _fail(command: str, message: str) -> int:
 def _describe(error: BaseException) -> str:
     message = " ".join(str(error).split()) or type(error).__name__
     if isinstance(error, OSError) and error.strerror and error.filename:
-        message = f"{error.filename}: {os.strerror(error.errno) if error.errno else error.strerror}"
+        message = f"{error.filename}: {error.strerror}"
     return message
 
 

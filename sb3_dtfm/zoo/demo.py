@@ -69,7 +69,7 @@ def run_demo(folder: Path, n_demonstrations: int, n_steps: int | None, n_episode
     print(
         f"\nSuccess: {result['successes']} of {result['episodes']} episodes = {result['success_rate']:.0%} "
         f"(95 % Wilson interval {result['interval'][0]:.0%} to {result['interval'][1]:.0%})\n"
-        f"Model:          {run_folder / f'{ENV_NAME}.zip'}\n"
+        f"Model:          {_model_file(run_folder)}\n"
         f"TensorBoard:    {tensorboard}\n"
         f"Learning curve: {curve}\n"
         f"Took {(time.monotonic() - start) / 60:.1f} minutes."
@@ -132,7 +132,7 @@ def evaluate_if_missing(run_folder: Path, n_episodes: int) -> dict[str, Any]:
         hyperparams=hyperparams,
         vec_env_cls=SubprocVecEnv,
     )
-    model = DTFM.load(run_folder / ENV_NAME)
+    model = DTFM.load(_model_file(run_folder))
     successes: list[bool] = []
 
     def count(locals_: dict[str, Any], _globals: dict[str, Any]) -> None:
@@ -156,15 +156,19 @@ def evaluate_if_missing(run_folder: Path, n_episodes: int) -> dict[str, Any]:
     return result
 
 
+def _model_file(run_folder: Path) -> Path:
+    return run_folder / f"{ENV_NAME}.zip"
+
+
 def _finished_runs(runs: Path) -> list[Path]:
     """Folders of runs whose final model is complete, oldest first."""
-    folders = [folder for folder in runs.glob(f"{ENV_NAME}_*") if zipfile.is_zipfile(folder / f"{ENV_NAME}.zip")]
+    folders = [folder for folder in runs.glob(f"{ENV_NAME}_*") if zipfile.is_zipfile(_model_file(folder))]
     return sorted(folders, key=lambda folder: int(folder.name.rsplit("_", 1)[1]))
 
 
 def _tensorboard_folder(folder: Path, run_folder: Path) -> Path:
     """The newest log that was begun before the run's model was saved: runs that were interrupted have logs too."""
-    saved = (run_folder / f"{ENV_NAME}.zip").stat().st_mtime
+    saved = _model_file(run_folder).stat().st_mtime
     logs = [event.parent for event in (folder / "tensorboard" / ENV_NAME).glob("DTFM_*/events.*")]
     logs = [log for log in logs if log.stat().st_ctime <= saved]
     return max(logs, key=lambda log: int(log.name.rsplit("_", 1)[1]))

@@ -75,6 +75,7 @@ def plot_learning_curve(
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     evaluations = load_evaluations(run_folder)
     steps, loss = load_scalar(tensorboard_folder, "train/loss") if tensorboard_folder else (np.array([]), np.array([]))
@@ -88,9 +89,11 @@ def plot_learning_curve(
             _draw_return(axes[0], evaluations)
         if len(loss):
             axes[1].plot(steps, loss, color=COLORS["loss"], linewidth=1.8)
-            axes[1].set(ylabel="train/loss", title="training")
+            axes[1].set(ylabel="train/loss", title="training", yscale="log")
+            axes[1].grid(which="minor", color="0.95")
         for axis in axes:
             axis.set(xlabel="gradient steps", xlim=(0, None))
+            axis.xaxis.set_major_locator(MaxNLocator("auto", integer=True))
             axis.grid(color="0.9")
         figure.suptitle(title or Path(run_folder).name)
         Path(output).parent.mkdir(parents=True, exist_ok=True)

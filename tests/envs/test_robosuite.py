@@ -244,6 +244,13 @@ def test_missing_robosuite_names_the_extra(monkeypatch):
         RobosuiteEnv("Lift")
 
 
+def test_a_machine_without_libgl_needs_no_opencv():
+    """robosuite imports OpenCV for a viewer of its own; OpenCV cannot be loaded where libGL is missing."""
+    program = "import sys; sys.modules['cv2'] = None\nfrom sb3_dtfm.envs.robosuite import RobosuiteEnv; RobosuiteEnv('Lift')"
+    result = run_python(program)
+    assert result.returncode == 0, result.stderr
+
+
 def test_controller_of_an_old_robomimic_file_moves_like_the_default(lift):
     env_args = {
         "env_name": "Lift",

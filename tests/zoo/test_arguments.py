@@ -8,11 +8,14 @@ from rl_zoo3.utils import StoreDict
 from sb3_dtfm.zoo.arguments import UsageError, enjoy_arguments, train_arguments
 from sb3_dtfm.zoo.registration import packaged_config
 
+ENV = ["--env", "Ant-v5"]
+
 
 def zoo_reads(arguments: list[str]) -> argparse.Namespace:
     """The relevant part of RL-Zoo's parser."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--algo")
+    parser.add_argument("--env")
     parser.add_argument("-conf", "--conf-file")
     parser.add_argument("-params", "--hyperparams", nargs="+", action=StoreDict)
     parser.add_argument("-n", type=int)
@@ -22,8 +25,10 @@ def zoo_reads(arguments: list[str]) -> argparse.Namespace:
 
 @pytest.mark.parametrize("algo", ["dt", "dtfm"])
 def test_conf_file_defaults_to_the_paper_and_small_is_packaged(algo):
-    assert zoo_reads(train_arguments(["--algo", algo])).conf_file == str(packaged_config(algo))
-    assert zoo_reads(train_arguments(["--algo", algo, "-conf", "small"])).conf_file == str(packaged_config(algo, "small"))
+    assert zoo_reads(train_arguments(["--algo", algo, *ENV])).conf_file == str(packaged_config(algo))
+    assert zoo_reads(train_arguments(["--algo", algo, *ENV, "-conf", "small"])).conf_file == str(
+        packaged_config(algo, "small")
+    )
     assert packaged_config(algo).parent.name == "zoo_configs"
     assert packaged_config(algo, "small").parent.name == "small"
 
@@ -35,7 +40,7 @@ def test_any_other_conf_file_stays():
 
 
 def test_shorthands_join_the_users_hyperparameters():
-    arguments = ["--algo", "dt", "--dataset", "it's a/file:1.hdf5", "-params", "batch_size:8", "-n", "5"]
+    arguments = ["--algo", "dt", *ENV, "--dataset", "it's a/file:1.hdf5", "-params", "batch_size:8", "-n", "5"]
     arguments += ["--dataset-fraction", "0.5", "--target-return", "3000", "--env-kwargs", "a:1", "--hyperparams", "seed:3"]
     read = zoo_reads(train_arguments(arguments))
     assert read.hyperparams == {
@@ -52,6 +57,15 @@ def test_shorthands_join_the_users_hyperparameters():
 def test_a_dataset_for_an_online_algorithm_is_refused():
     with pytest.raises(UsageError, match="--dataset: for --algo dt and dtfm only, not for sac"):
         train_arguments(["--algo", "sac", "--dataset", "x"])
+
+
+@pytest.mark.parametrize(
+    ("given", "missing"), [([], "--dataset, --target-return: needed"), (["--dataset", "x"], "--target-return: needed")]
+)
+def test_a_task_that_the_settings_do_not_list_needs_its_own(given, missing):
+    with pytest.raises(UsageError, match=f"{missing} for Hopper-v5"):
+        train_arguments(["--algo", "dt", "--env", "Hopper-v5", *given])
+    train_arguments(["--algo", "dt", "--env", "Hopper-v5", "--dataset", "x", "-params", "env_wrapper:'mine'"])
 
 
 def test_enjoy_looks_where_train_writes():

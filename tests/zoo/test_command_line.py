@@ -64,6 +64,7 @@ def test_rl_zoos_own_algorithms_still_train(workplace):
 
 
 def test_hyperparameters_can_be_searched(workplace, capsys):
+    small_model = ["--seed", "1"]
     search = [
         "--optimize-hyperparameters",
         "--n-trials",
@@ -74,7 +75,7 @@ def test_hyperparameters_can_be_searched(workplace, capsys):
         "1",
         "--no-optim-plots",
     ]
-    assert train("dtfm", *search) == 0
+    assert train("dtfm", *search, *small_model) == 0
     assert "Best trial:" in capsys.readouterr().out
 
 
@@ -88,7 +89,11 @@ def test_hyperparameters_can_be_searched(workplace, capsys):
         ),
         (tiny_training("dtfm", "--dataset", DATASET_ID, "--conf-file", "absent.yml"), "absent.yml: No such file"),
         (["train", "--algo", "dtfm", "--env", "HalfCheeta-v5"], "HalfCheetah-v5"),
-        (["train", "--algo", "dtfm", "--env", "Pendulum-v1", "--dataset", DATASET_ID], "ReturnToGoWrapper"),
+        (
+            ["train", "--algo", "dtfm", "--env", "Hopper-v5", "--dataset", DATASET_ID],
+            "--target-return: needed for Hopper-v5",
+        ),
+        (tiny_training("dt", "env_wrapper:None", "--dataset", DATASET_ID), "ReturnToGoWrapper"),
         (["enjoy", "--algo", "dtfm", *ENJOY], "logs/dtfm"),
         (["plot", "nowhere"], "nowhere/evaluations.npz does not exist"),
     ],

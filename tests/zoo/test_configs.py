@@ -33,7 +33,7 @@ def test_every_task_builds_its_model(env_id, settings):
         hyperparams = load(algo, settings)[env_id]
         wrapped = get_wrapper_class(hyperparams)(env)
         assert wrapped.get_wrapper_attr("target_return") == TARGETS[env_id]
-        assert hyperparams.pop("n_timesteps") >= 2500
+        assert hyperparams.pop("n_timesteps") >= 1500
         assert isinstance(hyperparams.pop("dataset"), str)
         del hyperparams["env_wrapper"]
         model = algorithm(env=wrapped, device="cpu", **hyperparams)
