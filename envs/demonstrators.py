@@ -83,7 +83,7 @@ class Manner:
             grasp_height_tolerance=rng.uniform(0.006, 0.01),
             dwell=int(rng.integers(0, 3)),
             lift_drift=rng.normal(0.0, 0.1, 2),
-            carry_height=rng.uniform(0.01, 0.05),
+            carry_height=rng.uniform(0.02, 0.06),
             release_offset=rng.normal(0.0, 0.01, 2),
             release_tolerance=rng.uniform(0.035, 0.055),
             noise=rng.uniform(0.05, 0.13),

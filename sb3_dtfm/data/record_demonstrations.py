@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Generator
 from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
@@ -84,8 +85,11 @@ def record_demonstrations(
     env = _environment(task)
     lengths: list[int] = []
     n_attempts = 0
-    with RobomimicWriter(output, env.env_args, overwrite, seed) as writer:
-        attempts = _attempts(task, seed, n_workers, n_episodes * ATTEMPTS_PER_EPISODE + 10)
+    limit = n_episodes * ATTEMPTS_PER_EPISODE + 10
+    with (
+        RobomimicWriter(output, env.env_args, overwrite, seed) as writer,
+        closing(_attempts(task, seed, n_workers, limit)) as attempts,
+    ):
         with tqdm(total=n_episodes, desc=f"Recording {task}", unit="episode", disable=not progress) as bar:
             for episode in attempts:
                 n_attempts += 1
@@ -96,7 +100,6 @@ def record_demonstrations(
                 bar.update(episode is not None)
                 if len(lengths) == n_episodes:
                     break
-        attempts.close()
         if len(lengths) < n_episodes:
             raise RuntimeError(
                 f"Only {len(lengths)} of {n_attempts} demonstrations of {task} succeeded; nothing is written."
