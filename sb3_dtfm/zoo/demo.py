@@ -22,6 +22,7 @@ ENV_ID = "robosuite/Lift-v0"
 ENV_NAME = ENV_ID.replace("/", "-")  # RL-Zoo's spelling in folders
 N_DEMONSTRATIONS = 200
 DATASET_FRACTION = 0.5
+EVALUATION_INTERVAL = 250  # gradient steps
 TRAINING_SEED = 0
 N_EVALUATION_ENVS = 4  # part of the result: each environment has a seed of its own
 EVALUATION_SEED = 10_000  # far from the training evaluations', which count up from TRAINING_SEED
@@ -105,7 +106,7 @@ def train_if_missing(folder: Path, dataset: Path, n_steps: int | None) -> Path:
     arguments += ["--log-folder", str(folder / "logs"), "--tensorboard-log", str(folder / "tensorboard")]
     arguments += ["--seed", str(TRAINING_SEED), "--verbose", "0", "--progress", "--log-interval", "50"]
     if n_steps is not None:
-        arguments += ["--n-timesteps", str(n_steps), "--eval-freq", str(min(500, n_steps))]
+        arguments += ["--n-timesteps", str(n_steps), "--eval-freq", str(min(EVALUATION_INTERVAL, n_steps))]
     print("sb3-dtfm train " + " ".join(arguments))
     cli.train(arguments)
     return _finished_runs(runs)[-1]
