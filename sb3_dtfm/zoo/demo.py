@@ -102,7 +102,7 @@ def train_if_missing(folder: Path, dataset: Path, n_steps: int | None) -> Path:
         return finished[-1]
     arguments = ["--algo", "dtfm", "--env", ENV_ID, "--conf-file", "small"]
     arguments += ["--dataset", str(dataset), "--dataset-fraction", str(DATASET_FRACTION)]
-    arguments += ["--eval-freq", "500", "--eval-episodes", "10", "--n-eval-envs", "5"]
+    arguments += ["--eval-freq", str(EVALUATION_INTERVAL), "--eval-episodes", "10", "--n-eval-envs", "5"]
     arguments += ["--log-folder", str(folder / "logs"), "--tensorboard-log", str(folder / "tensorboard")]
     arguments += ["--seed", str(TRAINING_SEED), "--verbose", "0", "--progress", "--log-interval", "50"]
     if n_steps is not None:
