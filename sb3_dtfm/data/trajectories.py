@@ -160,14 +160,14 @@ class TrajectoryBuffer:
         ends = np.zeros((2, len(lengths)), bool)
         start = n_read = 0
         for trajectory in trajectories:
-            if n_read == len(lengths) or len(trajectory) != lengths[n_read]:
-                announced = f"{lengths[n_read]} steps" if n_read < len(lengths) else "no such episode"
-                raise DatasetError(f"{source}, {trajectory.name}: holds {len(trajectory)} steps, announced: {announced}.")
             if observation_space is None:
                 observation_space = spaces.Box(-np.inf, np.inf, np.shape(trajectory.observations)[1:], np.float32)
             if n_read == 0:
                 observations = np.empty((n_steps, *observation_space.shape), np.float32)
             check_trajectory(trajectory, observation_space, action_space, source)
+            if n_read == len(lengths) or len(trajectory) != lengths[n_read]:
+                announced = f"{lengths[n_read]} steps" if n_read < len(lengths) else "no such episode"
+                raise DatasetError(f"{source}, {trajectory.name}: holds {len(trajectory)} steps, announced: {announced}.")
             stop = start + len(trajectory)
             observations[start:stop] = trajectory.observations
             actions[start:stop] = np.clip(trajectory.actions, action_space.low, action_space.high)
