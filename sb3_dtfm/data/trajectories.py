@@ -1,5 +1,6 @@
 """Recorded episodes in memory: a `Trajectory` each, and all of them flat in a `TrajectoryBuffer`, sampled in windows."""
 
+import copy
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -10,6 +11,8 @@ from gymnasium import spaces
 
 # Recorded float64 actions may pass a float32 bound by a rounding error; beyond this share of the range they are wrong.
 ACTION_TOLERANCE = 1e-4
+
+TENSORS = ("observations", "actions", "rewards", "returns_to_go", "timesteps")
 
 
 class DatasetError(ValueError):
@@ -215,9 +218,8 @@ class TrajectoryBuffer:
         """
         starts = np.concatenate([[0], np.cumsum(self.episode_lengths)])
         rows = th.from_numpy(np.concatenate([np.arange(starts[e], starts[e + 1]) for e in episodes]))
-        names = ("observations", "actions", "rewards", "returns_to_go", "timesteps")
         return TrajectoryBuffer(
-            {name: getattr(self, name)[rows] for name in names},
+            {name: getattr(self, name)[rows] for name in TENSORS},
             self.episode_lengths[episodes],
             self.episode_returns[episodes],
             self.terminated[episodes],
@@ -244,10 +246,11 @@ class TrajectoryBuffer:
         return self.select(np.sort(np.random.default_rng(seed).permutation(self.n_episodes)[:n_kept]))
 
     def to(self, device: th.device | str) -> "TrajectoryBuffer":
-        """Move the tensors to a device; `sample` then gathers there. Returns itself."""
-        for name in ("observations", "actions", "rewards", "returns_to_go", "timesteps"):
-            setattr(self, name, getattr(self, name).to(device))
-        return self
+        """The same buffer with its tensors on a device; `sample` then gathers there."""
+        moved = copy.copy(self)
+        for name in TENSORS:
+            setattr(moved, name, getattr(self, name).to(device))
+        return moved
 
     def sample(self, batch_size: int, context_length: int, generator: th.Generator | None = None) -> SequenceBatch:
         """
