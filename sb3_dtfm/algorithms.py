@@ -52,12 +52,12 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
     :param seed: seed of weights, batches and acting
     :param device: "auto", "cpu" or "cuda"
     :param _init_setup_model: build the network at once
+    :raises ValueError: no dataset, or an argument out of range
     :raises DatasetError: the dataset cannot be read, or does not fit the environment
     """
 
     policy: SequencePolicy
     action_space: spaces.Box
-    rollout_buffer: None = None
 
     def __init__(
         self,
@@ -116,15 +116,11 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         self._training_seconds = 0.0
         if _init_setup_model:
             self._check_arguments()
-            buffer = self._load_buffer() if dataset is not None else None
-            if buffer is not None:
-                self.max_timestep = int(buffer.episode_lengths.max())
-                self.score_reference = buffer.score_reference
-            elif env is None:
-                raise ValueError(f"{type(self).__name__} needs a dataset or an env to know its spaces; both are None.")
+            buffer = self._load_buffer()
+            self.max_timestep = int(buffer.episode_lengths.max())
+            self.score_reference = buffer.score_reference
             self._setup_model()
-            if buffer is not None:
-                self.policy.set_statistics(buffer.observations, buffer.returns_to_go)
+            self.policy.set_statistics(buffer.observations, buffer.returns_to_go)
 
     def _check_arguments(self) -> None:
         choices = {"learning_rate_schedule": LEARNING_RATE_SCHEDULES, "precision": PRECISIONS}

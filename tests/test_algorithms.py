@@ -285,6 +285,7 @@ def test_arguments_out_of_range_are_refused_by_name(name, value, cheetah_buffer)
         make_model(DT, cheetah_buffer, **{name: value})
 
 
-def test_constructor_without_dataset_or_env_says_what_is_missing():
-    with pytest.raises(ValueError, match="DT needs a dataset or an env"):
-        DT("MultiInputPolicy")
+@pytest.mark.parametrize("env", [None, "wrapped"])
+def test_a_new_model_needs_a_dataset(env):
+    with pytest.raises(ValueError, match="DT has no dataset to learn from: give one to the constructor"):
+        DT("MultiInputPolicy", env=make_env() if env else None)
