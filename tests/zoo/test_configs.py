@@ -3,10 +3,12 @@
 import copy
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import yaml
 from rl_zoo3.utils import get_wrapper_class
 
+from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.zoo.registration import OFFLINE_ALGORITHMS, packaged_config
 
 TARGETS = {
@@ -25,10 +27,22 @@ def load(algo: str, settings: str | None) -> dict:
     return yaml.safe_load(packaged_config(algo, settings).read_text())
 
 
+def record_three_steps(env: gym.Env) -> TrajectoryBuffer:
+    observations, actions, rewards = [env.reset(seed=0)[0]], [], []
+    for _ in range(3):
+        actions.append(env.action_space.sample())
+        observation, reward, *_ = env.step(actions[-1])
+        observations.append(observation)
+        rewards.append(reward)
+    trajectory = Trajectory(np.array(observations[:-1]), np.array(actions), np.array(rewards))
+    return TrajectoryBuffer.from_trajectories([trajectory], env.action_space)
+
+
 @pytest.mark.parametrize("settings", SETTINGS)
 @pytest.mark.parametrize("env_id", TARGETS)
 def test_every_task_builds_its_model(env_id, settings):
     env = gym.make(env_id)
+    buffer = record_three_steps(env)
     for algo, algorithm in OFFLINE_ALGORITHMS.items():
         hyperparams = load(algo, settings)[env_id]
         wrapped = get_wrapper_class(hyperparams)(env)
@@ -36,7 +50,7 @@ def test_every_task_builds_its_model(env_id, settings):
         assert hyperparams.pop("n_timesteps") >= 1500
         assert isinstance(hyperparams.pop("dataset"), str)
         del hyperparams["env_wrapper"]
-        model = algorithm(env=wrapped, device="cpu", **hyperparams)
+        model = algorithm(env=wrapped, dataset=buffer, device="cpu", **hyperparams)
         assert isinstance(model.learning_rate, float)
         assert model.batch_size == hyperparams["batch_size"]
     env.close()
