@@ -11,13 +11,6 @@ from sb3_dtfm.envs.robosuite import RobosuiteEnv
 
 
 @pytest.fixture(scope="module")
-def lift():
-    env = RobosuiteEnv("Lift")
-    yield env
-    env.close()
-
-
-@pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     path = tmp_path_factory.mktemp("recording") / "lift.hdf5"
     return path, record_demonstrations("lift", 4, path, seed=3, n_workers=1, progress=False)

@@ -56,20 +56,6 @@ print(image.shape, image.dtype, image.std() > 10)
 """
 
 
-@pytest.fixture(scope="module")
-def lift():
-    env = RobosuiteEnv("Lift")
-    yield env
-    env.close()
-
-
-@pytest.fixture(scope="module")
-def can():
-    env = RobosuiteEnv("Can")
-    yield env
-    env.close()
-
-
 @pytest.fixture(params=["lift", "can"])
 def env(request):
     return request.getfixturevalue(request.param)
