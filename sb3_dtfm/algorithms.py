@@ -281,8 +281,9 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         self.policy.set_training_mode(True)  # an evaluation in between leaves evaluation mode on
         self._update_learning_rate(self.policy.optimizer)
         batch = buffer.sample(self.batch_size, self.context_length, generator)
+        noise = self.policy.draw_noise(batch, generator)
         with precision:
-            loss, parts = self.policy.compute_loss(batch, generator)
+            loss, parts = self.policy.compute_loss(batch, *noise)
         self.policy.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.network.parameters(), self.max_grad_norm or math.inf)

@@ -126,11 +126,21 @@ class SequencePolicy(BasePolicy):
         """A regression head beside the action head, if the policy has one."""
         return None
 
+    def draw_noise(self, batch: Any, generator: th.Generator) -> tuple[th.Tensor, ...]:
+        """
+        What the loss draws at random, one row per window: drawn apart from it, so that the loss is a plain function.
+
+        :param batch: a :class:`~sb3_dtfm.data.SequenceBatch`
+        :param generator: on the policy's device
+        :return: further arguments of :meth:`compute_loss`, each (B, ...)
+        """
+        return ()
+
     @abstractmethod
-    def compute_loss(self, batch: NamedTuple, generator: th.Generator) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+    def compute_loss(self, batch: Any, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """
         :param batch: a :class:`~sb3_dtfm.data.SequenceBatch`, actions in the environment's range
-        :param generator: source of the loss's own randomness
+        :param noise: what :meth:`draw_noise` gave for the batch
         :return: the loss to minimise, and its parts by their logged names
         """
 
@@ -317,7 +327,7 @@ class DTPolicy(SequencePolicy):
         assert isinstance(network.head, RegressionHead)
         return network.head
 
-    def compute_loss(self, batch: Any, generator: th.Generator) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+    def compute_loss(self, batch: Any, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         windows = self.scaled_windows(batch)
         hidden = self.hidden_states(self.network, windows)
         loss = self._head(self.network).loss(hidden, windows.actions, windows.mask)
@@ -377,12 +387,16 @@ class DTFMPolicy(SequencePolicy):
     def _make_auxiliary_head(self) -> RegressionHead | None:
         return RegressionHead(self.embed_dim, self.action_dim) if self.regression_coef > 0 else None
 
-    def compute_loss(self, batch: Any, generator: th.Generator) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+    def draw_noise(self, batch: Any, generator: th.Generator) -> tuple[th.Tensor, ...]:
+        noise = th.randn(batch.actions.shape, generator=generator, device=batch.actions.device)
+        tau = th.rand(batch.mask.shape, generator=generator, device=batch.mask.device)
+        return noise, tau
+
+    def compute_loss(self, batch: Any, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        starts, tau = noise
         windows = self.scaled_windows(batch)
         hidden = self.hidden_states(self.network, windows)
-        noise = th.randn(windows.actions.shape, generator=generator, device=hidden.device)
-        tau = th.rand(windows.mask.shape, generator=generator, device=hidden.device)
-        flow_loss = self._head(self.network).loss(hidden, windows.actions, windows.mask, noise, tau)
+        flow_loss = self._head(self.network).loss(hidden, windows.actions, windows.mask, starts, tau)
         if self.network.auxiliary_head is None:
             return flow_loss, {"flow_loss": flow_loss}
         regression_loss = self.network.auxiliary_head.loss(hidden, windows.actions, windows.mask)
