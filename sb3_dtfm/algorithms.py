@@ -286,7 +286,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
             loss, parts = self.policy.compute_loss(batch, *noise)
         self.policy.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        grad_norm = th.nn.utils.clip_grad_norm_(self.policy.network.parameters(), self.max_grad_norm or math.inf)
+        grad_norm = th.nn.utils.clip_grad_norm_(self.policy.clipped_parameters(), self.max_grad_norm or math.inf)
         self.policy.optimizer.step()
         self._n_updates += 1
         if self.ema_decay > 0:

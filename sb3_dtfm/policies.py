@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_dtfm.context import Context, empty_context, push, unpack_observation, with_action
-from sb3_dtfm.networks.flow import check_solver
+from sb3_dtfm.networks.flow import ONE_STEP, check_solver
 from sb3_dtfm.networks.heads import FlowHead, RegressionHead
 from sb3_dtfm.networks.trunk import SequenceTrunk
 
@@ -20,6 +20,8 @@ from sb3_dtfm.networks.trunk import SequenceTrunk
 OBSERVATION_CLIP = 10.0
 # Steps after which deterministic acting repeats its noise; longer than a usual episode.
 NOISE_PERIOD = 1024
+# Newest steps of each window that the one-step network learns from: where acting asks it, and few enough to cost little.
+ONE_STEP_POSITIONS = 4
 
 
 class SequenceTensors(NamedTuple):
@@ -161,6 +163,10 @@ class SequencePolicy(BasePolicy):
         others = [parameter for parameter in self.network.parameters() if id(parameter) not in decayed]
         groups = [{"params": matrices, "weight_decay": self.weight_decay}, {"params": others, "weight_decay": 0.0}]
         return self.optimizer_class(groups, lr=learning_rate, fused=True)  # type: ignore[call-arg]
+
+    def clipped_parameters(self) -> list[nn.Parameter]:
+        """The parameters whose gradient norm is logged and clipped."""
+        return list(self.network.parameters())
 
     def set_statistics(self, observations: th.Tensor, returns_to_go: th.Tensor) -> None:
         """
@@ -346,8 +352,9 @@ class DTFMPolicy(SequencePolicy):
 
     :param flow_hidden_dim: width of the vector field's hidden layers
     :param flow_n_layers: number of its hidden layers
-    :param solver: ODE solver for acting: euler, midpoint, heun or rk4
-    :param n_solver_steps: steps of the solver
+    :param solver: how to act: an ODE solver, euler, midpoint, heun or rk4; or one_step, the network that learnt its end
+    :param n_solver_steps: steps of the ODE solver
+    :param one_step: train that network; a few percent of a gradient step, no influence on the rest
     :param regression_coef: weight of the auxiliary action regression; 0 leaves it out
 
     The other parameters are those of :class:`SequencePolicy`.
@@ -362,6 +369,7 @@ class DTFMPolicy(SequencePolicy):
         flow_n_layers: int = 3,
         solver: str = "euler",
         n_solver_steps: int = 50,
+        one_step: bool = True,
         regression_coef: float = 0.0,
         **kwargs: Any,
     ) -> None:
@@ -369,6 +377,7 @@ class DTFMPolicy(SequencePolicy):
         self.flow_n_layers = flow_n_layers
         self.solver = solver
         self.n_solver_steps = n_solver_steps
+        self.one_step = one_step
         self.regression_coef = regression_coef
         super().__init__(*args, **kwargs)
         noise_generator = th.Generator().manual_seed(0 if self.seed is None else self.seed)
@@ -376,8 +385,8 @@ class DTFMPolicy(SequencePolicy):
         self._acting_generator: th.Generator | None = None
 
     def _make_head(self) -> FlowHead:
-        check_solver(self.solver, self.n_solver_steps)
-        return FlowHead(self.embed_dim, self.action_dim, self.flow_hidden_dim, self.flow_n_layers)
+        self._check_solver(self.solver, self.n_solver_steps)
+        return FlowHead(self.embed_dim, self.action_dim, self.flow_hidden_dim, self.flow_n_layers, self.one_step)
 
     @staticmethod
     def _head(network: SequenceNetwork) -> FlowHead:
@@ -396,25 +405,39 @@ class DTFMPolicy(SequencePolicy):
         starts, tau = noise
         windows = self.scaled_windows(batch)
         hidden = self.hidden_states(self.network, windows)
-        flow_loss = self._head(self.network).loss(hidden, windows.actions, windows.mask, starts, tau)
-        if self.network.auxiliary_head is None:
-            return flow_loss, {"flow_loss": flow_loss}
-        regression_loss = self.network.auxiliary_head.loss(hidden, windows.actions, windows.mask)
-        loss = flow_loss + self.regression_coef * regression_loss
-        return loss, {"flow_loss": flow_loss, "regression_loss": regression_loss}
+        head = self._head(self.network)
+        parts = {"flow_loss": head.loss(hidden, windows.actions, windows.mask, starts, tau)}
+        loss = parts["flow_loss"]
+        if self.network.auxiliary_head is not None:
+            parts["regression_loss"] = self.network.auxiliary_head.loss(hidden, windows.actions, windows.mask)
+            loss = loss + self.regression_coef * parts["regression_loss"]
+        if self.one_step:
+            newest = slice(-ONE_STEP_POSITIONS, None)
+            parts["one_step_loss"] = head.one_step_loss(hidden[:, newest], windows.mask[:, newest], starts[:, newest])
+            loss = loss + parts["one_step_loss"]
+        return loss, parts
+
+    def clipped_parameters(self) -> list[nn.Parameter]:
+        """All but the one-step network's: it must not change how the others are clipped."""
+        return [p for name, p in self.network.named_parameters() if not name.startswith("head.jump")]
 
     def _generate(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
         return self._head(self.acting_network)(hidden, noise, self.solver, self.n_solver_steps)
 
-    def set_solver(self, solver: str, n_solver_steps: int) -> None:
-        """
-        Choose another ODE solver for acting; the trained weights do not depend on it.
-
-        :param solver: euler, midpoint, heun or rk4
-        :param n_solver_steps: steps of the solver
-        :raises ValueError: unknown solver, or fewer than one step
-        """
+    def _check_solver(self, solver: str, n_solver_steps: int) -> None:
         check_solver(solver, n_solver_steps)
+        if solver == ONE_STEP and not self.one_step:
+            raise ValueError(f"solver={ONE_STEP!r} needs a model that was trained with policy_kwargs=dict(one_step=True).")
+
+    def set_solver(self, solver: str, n_solver_steps: int = 1) -> None:
+        """
+        Choose how to act; the trained weights do not depend on it.
+
+        :param solver: euler, midpoint, heun or rk4, or one_step: a single evaluation of the network that learnt their end
+        :param n_solver_steps: steps of the ODE solver
+        :raises ValueError: unknown solver, fewer than one step, or one_step of a model that did not learn it
+        """
+        self._check_solver(solver, n_solver_steps)
         self.solver = solver
         self.n_solver_steps = n_solver_steps
 
@@ -430,7 +453,7 @@ class DTFMPolicy(SequencePolicy):
         return _standard_normal(len(timestep), self.action_dim, self._acting_generator)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        names = ("flow_hidden_dim", "flow_n_layers", "solver", "n_solver_steps", "regression_coef")
+        names = ("flow_hidden_dim", "flow_n_layers", "solver", "n_solver_steps", "one_step", "regression_coef")
         return {**super()._get_constructor_parameters(), **{name: getattr(self, name) for name in names}}
 
 

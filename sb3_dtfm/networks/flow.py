@@ -14,6 +14,9 @@ from torch.nn import functional as F
 Field = Callable[[th.Tensor, float], th.Tensor]
 SolverStep = Callable[[Field, th.Tensor, float, float], th.Tensor]
 
+# Not an ODE solver: a network of its own that has learnt where the solver would end (see heads.py).
+ONE_STEP = "one_step"
+
 
 def interpolate(noise: th.Tensor, action: th.Tensor, tau: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """
@@ -44,48 +47,59 @@ def sinusoidal_embedding(tau: th.Tensor, embedding_dim: int) -> th.Tensor:
     return th.cat((angles.sin(), angles.cos()), dim=-1)
 
 
-class VectorField(nn.Module):
+class FilmNetwork(nn.Module):
     """
-    Velocity v(x, tau, h): an MLP whose every hidden layer is scaled and shifted (FiLM, Perez et al., 2018) by tau and h.
-
-    The FiLM map of [psi(tau), h] is linear, so its two halves are kept apart: :meth:`condition` computes the half of h
-    once per action, and a solver's steps only add the half of tau.
+    MLP from A to A numbers whose every hidden layer is scaled and shifted from outside (FiLM, Perez et al., 2018).
 
     :param action_dim: A
-    :param condition_dim: width D of h
+    :param condition_dim: width D of the hidden state h
     :param hidden_dim: width of the hidden layers
     :param n_layers: number of hidden layers
+    """
+
+    def __init__(self, action_dim: int, condition_dim: int, hidden_dim: int = 512, n_layers: int = 3) -> None:
+        super().__init__()
+        self.n_layers = n_layers
+        self.film_dim = 2 * hidden_dim * n_layers
+        sizes = [action_dim] + [hidden_dim] * n_layers
+        self.layers = nn.ModuleList(nn.Linear(sizes[i], sizes[i + 1]) for i in range(n_layers))
+        self.film_condition = nn.Linear(condition_dim, self.film_dim)
+        self.output = nn.Linear(hidden_dim, action_dim)
+
+    def forward(self, x: th.Tensor, film: th.Tensor) -> th.Tensor:
+        """
+        :param x: (..., A)
+        :param film: (..., 2 * hidden_dim * n_layers), scales and shifts: `film_condition(h)` and what is added to it
+        :return: (..., A)
+        """
+        for layer, layer_film in zip(self.layers, film.chunk(self.n_layers, dim=-1), strict=True):
+            scale, shift = layer_film.chunk(2, dim=-1)
+            x = F.silu(layer(x) * (1.0 + scale) + shift)
+        return self.output(x)
+
+
+class VectorField(FilmNetwork):
+    """
+    Velocity v(x, tau, h): a FiLM network whose scales and shifts come from tau and h.
+
+    The FiLM map of [psi(tau), h] is linear, so its two halves are kept apart: the half of h is computed once per action,
+    the half of tau once for all times of a solver.
+
     :param time_embedding_dim: size of psi(tau)
+
+    The other parameters are those of :class:`FilmNetwork`.
     """
 
     def __init__(
         self, action_dim: int, condition_dim: int, hidden_dim: int = 512, n_layers: int = 3, time_embedding_dim: int = 128
     ) -> None:
-        super().__init__()
-        self.n_layers = n_layers
+        super().__init__(action_dim, condition_dim, hidden_dim, n_layers)
         self.time_embedding_dim = time_embedding_dim
-        sizes = [action_dim] + [hidden_dim] * n_layers
-        self.layers = nn.ModuleList(nn.Linear(sizes[i], sizes[i + 1]) for i in range(n_layers))
-        self.film_condition = nn.Linear(condition_dim, 2 * hidden_dim * n_layers)
-        self.film_time = nn.Linear(time_embedding_dim, 2 * hidden_dim * n_layers, bias=False)
-        self.output = nn.Linear(hidden_dim, action_dim)
+        self.film_time = nn.Linear(time_embedding_dim, self.film_dim, bias=False)
 
-    def condition(self, hidden: th.Tensor) -> th.Tensor:
-        """The share of h, (..., D), in all scales and shifts: (..., 2 * hidden_dim * n_layers)."""
-        return self.film_condition(hidden)
-
-    def forward(self, x: th.Tensor, tau: th.Tensor, condition: th.Tensor) -> th.Tensor:
-        """
-        :param x: (..., A)
-        :param tau: (...) or a single time for all, in [0, 1]
-        :param condition: (..., 2 * hidden_dim * n_layers) from :meth:`condition`
-        :return: velocity, (..., A)
-        """
-        film = condition + self.film_time(sinusoidal_embedding(tau, self.time_embedding_dim))
-        for layer, layer_film in zip(self.layers, film.chunk(self.n_layers, dim=-1), strict=True):
-            scale, shift = layer_film.chunk(2, dim=-1)
-            x = F.silu(layer(x) * (1.0 + scale) + shift)
-        return self.output(x)
+    def time_share(self, tau: th.Tensor) -> th.Tensor:
+        """The share of times in [0, 1], (...), in all scales and shifts: (..., 2 * hidden_dim * n_layers)."""
+        return self.film_time(sinusoidal_embedding(tau, self.time_embedding_dim))
 
 
 def _euler_step(field: Field, x: th.Tensor, tau: float, step: float) -> th.Tensor:
@@ -123,7 +137,7 @@ def integrate(field: Field, noise: th.Tensor, solver: str = "euler", n_solver_st
     Follow dx/dtau = field(x, tau) from tau = 0 to tau = 1 in equal steps.
 
     The global error falls with the step to the power 1 (euler), 2 (midpoint, heun) or 4 (rk4), at 1, 2, 2 and 4 field
-    evaluations a step.
+    evaluations a step, all at times that :func:`solver_times` lists.
 
     :param field: velocity of (x, tau), shaped like x
     :param noise: (..., A), x at tau = 0
@@ -139,11 +153,18 @@ def integrate(field: Field, noise: th.Tensor, solver: str = "euler", n_solver_st
     return x
 
 
+def solver_times(solver: str, n_solver_steps: int) -> th.Tensor:
+    """Equally spaced times from 0 to 1 among which a solver evaluates its field: whole steps, or half ones as well."""
+    intervals = n_solver_steps if solver == "euler" else 2 * n_solver_steps
+    return th.linspace(0.0, 1.0, intervals + 1)
+
+
 def check_solver(solver: str, n_solver_steps: int) -> None:
     """
     :raises ValueError: unknown solver, or fewer than one step
     """
-    if solver not in SOLVERS:
-        raise ValueError(f"solver must be one of {', '.join(SOLVERS)}, got {solver!r}.")
+    accepted = (*SOLVERS, ONE_STEP)
+    if solver not in accepted:
+        raise ValueError(f"solver must be one of {', '.join(accepted)}, got {solver!r}.")
     if n_solver_steps < 1:
         raise ValueError(f"n_solver_steps must be at least 1, got {n_solver_steps}.")

@@ -3,7 +3,10 @@
 import torch as th
 from torch import nn
 
-from sb3_dtfm.networks.flow import VectorField, integrate, interpolate
+from sb3_dtfm.networks.flow import ONE_STEP, FilmNetwork, VectorField, integrate, interpolate, solver_times
+
+# Solver steps whose end the one-step network learns.
+DISTILLED_STEPS = 16
 
 
 def masked_mean(values: th.Tensor, mask: th.Tensor) -> th.Tensor:
@@ -47,15 +50,22 @@ class FlowHead(nn.Module):
     """
     Flow-matching head: the hidden state conditions a vector field that carries Gaussian noise to the action.
 
+    With `one_step` a second network learns where that ends, so that an action can take one evaluation instead of one per
+    solver step. It learns from the field and gives nothing back: trunk and field are what they are without it.
+
     :param embed_dim: D
     :param action_dim: A
     :param hidden_dim: width of the vector field's hidden layers
     :param n_layers: number of hidden layers of the vector field
+    :param one_step: have the second network
     """
 
-    def __init__(self, embed_dim: int, action_dim: int, hidden_dim: int = 512, n_layers: int = 3) -> None:
+    def __init__(
+        self, embed_dim: int, action_dim: int, hidden_dim: int = 512, n_layers: int = 3, one_step: bool = True
+    ) -> None:
         super().__init__()
         self.vector_field = VectorField(action_dim, embed_dim, hidden_dim, n_layers)
+        self.jump = FilmNetwork(action_dim, embed_dim, hidden_dim, n_layers) if one_step else None
 
     def loss(self, hidden: th.Tensor, actions: th.Tensor, mask: th.Tensor, noise: th.Tensor, tau: th.Tensor) -> th.Tensor:
         """
@@ -69,22 +79,40 @@ class FlowHead(nn.Module):
         :return: mean squared error over valid steps
         """
         x, velocity = interpolate(noise, actions, tau.unsqueeze(-1))
-        predicted = self.vector_field(x, tau, self.vector_field.condition(hidden))
-        return masked_mean((predicted - velocity).square(), mask)
+        film = self.vector_field.film_condition(hidden) + self.vector_field.time_share(tau)
+        return masked_mean((self.vector_field(x, film) - velocity).square(), mask)
+
+    def one_step_loss(self, hidden: th.Tensor, mask: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        """
+        Distillation (Luhman and Luhman, 2021): squared error of the jump against where the solver ends, from the same noise.
+
+        :param hidden: (B, K, D); no gradient flows into it
+        :param mask: (B, K) bool
+        :param noise: (B, K, A), standard normal
+        :return: mean squared error over valid steps
+        """
+        hidden = hidden.detach()
+        with th.no_grad():
+            target = self(hidden, noise, "euler", DISTILLED_STEPS).clamp(-1.0, 1.0)
+        return masked_mean((self(hidden, noise, ONE_STEP) - target).square(), mask)
 
     def forward(self, hidden: th.Tensor, noise: th.Tensor, solver: str = "euler", n_solver_steps: int = 50) -> th.Tensor:
         """
         Carry noise to actions.
 
-        :param hidden: (B, D)
-        :param noise: (B, A), standard normal
-        :param solver: ODE solver, a key of `sb3_dtfm.networks.flow.SOLVERS`
-        :param n_solver_steps: number of its steps
-        :return: (B, A), in [-1, 1] as far as the field learned it; the policy clips
+        :param hidden: (..., D)
+        :param noise: (..., A), standard normal
+        :param solver: "one_step", or an ODE solver, a key of `sb3_dtfm.networks.flow.SOLVERS`
+        :param n_solver_steps: number of the ODE solver's steps
+        :return: (..., A), in [-1, 1] as far as it was learnt; the policy clips
         """
-        condition = self.vector_field.condition(hidden)
+        if solver == ONE_STEP:
+            assert self.jump is not None
+            return noise + self.jump(noise, self.jump.film_condition(hidden))
+        times = solver_times(solver, n_solver_steps).to(hidden.device)
+        condition, time_shares = self.vector_field.film_condition(hidden), self.vector_field.time_share(times)
 
         def field(x: th.Tensor, tau: float) -> th.Tensor:
-            return self.vector_field(x, th.full((), tau, device=x.device), condition)
+            return self.vector_field(x, condition + time_shares[round(tau * (len(times) - 1))])
 
         return integrate(field, noise, solver, n_solver_steps)

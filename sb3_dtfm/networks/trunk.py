@@ -4,6 +4,8 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_dtfm.networks.dropout import dropout, dropout_add
+
 ALL = slice(None)
 
 
@@ -20,20 +22,20 @@ class TransformerBlock(nn.Module):
         self.mlp_norm = nn.LayerNorm(embed_dim)
         self.mlp_in = nn.Linear(embed_dim, 4 * embed_dim)
         self.mlp_out = nn.Linear(4 * embed_dim, embed_dim)
-        self.residual_dropout = nn.Dropout(dropout)
 
-    def forward(self, tokens: th.Tensor, attention_mask: th.Tensor, queries: slice = ALL) -> th.Tensor:
+    def forward(self, tokens: th.Tensor, attention_bias: th.Tensor, queries: slice = ALL) -> th.Tensor:
         """
         :param tokens: (B, L, D)
-        :param attention_mask: (B, 1, L, L) bool, True where the query (third axis) may see the key (fourth)
+        :param attention_bias: (B * heads, L, L), 0 where the query (second axis) may see the key (third), else -inf
         :param queries: the Q tokens to compute; nothing is spent on the others beyond their keys and values
         :return: (B, Q, D)
         """
-        attended = self._attend(self.attention_norm(tokens), attention_mask[:, :, queries], queries)
-        tokens = tokens[:, queries] + self.residual_dropout(attended)
-        return tokens + self.residual_dropout(self.mlp_out(F.gelu(self.mlp_in(self.mlp_norm(tokens)))))
+        attended = self._attend(self.attention_norm(tokens), attention_bias[:, :, queries], queries)
+        tokens = dropout_add(tokens[:, queries], attended, self.dropout, self.training)
+        mapped = self.mlp_out(F.gelu(self.mlp_in(self.mlp_norm(tokens))))
+        return dropout_add(tokens, mapped, self.dropout, self.training)
 
-    def _attend(self, tokens: th.Tensor, attention_mask: th.Tensor, queries: slice) -> th.Tensor:
+    def _attend(self, tokens: th.Tensor, attention_bias: th.Tensor, queries: slice) -> th.Tensor:
         width = tokens.shape[-1]
         if queries == ALL:
             query, key, value = self.attention_in(tokens).split(width, dim=-1)
@@ -41,18 +43,33 @@ class TransformerBlock(nn.Module):
             weight, bias = self.attention_in.weight, self.attention_in.bias
             query = F.linear(tokens[:, queries], weight[:width], bias[:width])
             key, value = F.linear(tokens, weight[width:], bias[width:]).split(width, dim=-1)
-        attended = F.scaled_dot_product_attention(
-            self._split_heads(query),
-            self._split_heads(key),
-            self._split_heads(value),
-            attn_mask=attention_mask,
-            dropout_p=self.dropout if self.training else 0.0,
-        )
+        dropout_p = self.dropout if self.training else 0.0
+        attended = attention(*map(self._split_heads, (query, key, value)), attention_bias, dropout_p)
         return self.attention_out(attended.transpose(1, 2).flatten(start_dim=2))
 
     def _split_heads(self, tokens: th.Tensor) -> th.Tensor:
         """From (B, L, D) to (B, heads, L, D / heads)."""
         return tokens.unflatten(-1, (self.n_heads, -1)).transpose(1, 2)
+
+
+def attention(query: th.Tensor, key: th.Tensor, value: th.Tensor, bias: th.Tensor, dropout_p: float) -> th.Tensor:
+    """
+    Scaled dot-product attention (Vaswani et al., 2017): torch's own, but for dropout on a CPU, where its masks are slow.
+
+    :param query: (B, heads, Q, d)
+    :param key: (B, heads, L, d)
+    :param value: (B, heads, L, d)
+    :param bias: (B, heads, Q, L), added to the scores
+    :param dropout_p: dropout probability of the attention weights
+    :return: (B, heads, Q, d)
+    """
+    if dropout_p == 0.0 or query.device.type != "cpu":
+        return F.scaled_dot_product_attention(query, key, value, attn_mask=bias, dropout_p=dropout_p)
+    shape = query.shape
+    query, key, value, bias = (x.flatten(end_dim=1) for x in (query, key, value, bias))
+    scores = th.baddbmm(bias, query, key.transpose(1, 2), alpha=query.shape[-1] ** -0.5)
+    weights = dropout(scores.softmax(dim=-1), dropout_p, training=True)
+    return th.bmm(weights, value).view(shape)
 
 
 class SequenceTrunk(nn.Module):
@@ -93,7 +110,7 @@ class SequenceTrunk(nn.Module):
         self.embed_observation = nn.Linear(observation_dim, embed_dim)
         self.embed_action = nn.Linear(action_dim, embed_dim)
         self.embed_timestep = nn.Embedding(max_timestep, embed_dim)
-        self.embedding_dropout = nn.Dropout(dropout)
+        self.dropout = dropout
         self.blocks = nn.ModuleList(TransformerBlock(embed_dim, n_heads, dropout) for _ in range(n_layers))
         self.final_norm = nn.LayerNorm(embed_dim)
         self.apply(self._initialize)
@@ -136,13 +153,15 @@ class SequenceTrunk(nn.Module):
             ),
             dim=2,
         ).view(batch, 3 * context_length, self.embed_dim)
-        tokens = self.embedding_dropout(tokens[:, :-1])  # nothing attends to the last action
-        attention_mask = causal_mask(mask.repeat_interleave(3, dim=1)[:, :-1])
+        tokens = dropout(tokens[:, :-1], self.dropout, self.training)  # nothing attends to the last action
+        allowed = causal_mask(mask.repeat_interleave(3, dim=1)[:, :-1])
+        attention_bias = th.zeros_like(allowed, dtype=tokens.dtype).masked_fill_(~allowed, -th.inf)
+        attention_bias = attention_bias.expand(-1, self.blocks[0].n_heads, -1, -1)
         *lower_blocks, last_block = self.blocks
         for block in lower_blocks:
-            tokens = block(tokens, attention_mask)
+            tokens = block(tokens, attention_bias)
         observation_tokens = slice(-1, None) if last_only else slice(1, None, 3)
-        return self.final_norm(last_block(tokens, attention_mask, observation_tokens))
+        return self.final_norm(last_block(tokens, attention_bias, observation_tokens))
 
 
 def causal_mask(valid: th.Tensor) -> th.Tensor:

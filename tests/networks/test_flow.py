@@ -79,7 +79,7 @@ def test_film_halves_add_up_to_one_linear_map_of_time_and_condition():
     for i, layer in enumerate(field.layers):
         scale, shift = joint[:, 32 * i : 32 * i + 16], joint[:, 32 * i + 16 : 32 * i + 32]
         x = th.nn.functional.silu(layer(x) * (1 + scale) + shift)
-    assert th.allclose(field(noise, tau, field.condition(hidden)), field.output(x), atol=1e-5)
+    assert th.allclose(field(noise, field.film_condition(hidden) + field.time_share(tau)), field.output(x), atol=1e-5)
 
 
 def test_a_flow_head_learns_two_modes_that_regression_would_average():
