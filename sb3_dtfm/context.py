@@ -16,7 +16,8 @@ class Context(NamedTuple):
     Windows of B environments, newest step last, padded on the left.
 
     Shapes: observations (B, K, O) as the environment gives them, actions (B, K, A) in [-1, 1], returns_to_go (B, K) in
-    environment reward units, timesteps (B, K) int64, mask (B, K) bool, False on padded steps.
+    environment reward units, timesteps (B, K) int64, mask (B, K) bool, False on padded steps, keys_values (B, ...), what the policy
+    keeps of its earlier computation, (B, 0) if nothing.
     """
 
     observations: np.ndarray
@@ -24,6 +25,7 @@ class Context(NamedTuple):
     returns_to_go: np.ndarray
     timesteps: np.ndarray
     mask: np.ndarray
+    keys_values: np.ndarray
 
 
 def empty_context(n_rows: int, context_length: int, observation_dim: int, action_dim: int) -> Context:
@@ -34,6 +36,7 @@ def empty_context(n_rows: int, context_length: int, observation_dim: int, action
         np.zeros((n_rows, context_length), np.float32),
         np.zeros((n_rows, context_length), np.int64),
         np.zeros((n_rows, context_length), bool),
+        np.zeros((n_rows, 0), np.float32),
     )
 
 
@@ -66,6 +69,7 @@ def push(
         _shift(context.returns_to_go, return_to_go),
         _shift(context.timesteps, timestep),
         np.concatenate((context.mask[:, 1:] & keep, np.ones_like(keep)), axis=1),
+        context.keys_values,
     )
 
 

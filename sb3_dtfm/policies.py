@@ -65,6 +65,8 @@ class SequencePolicy(BasePolicy):
     :param dropout: dropout probability of the trunk
     :param weight_decay: AdamW's, on weight matrices only
     :param ema: keep an exponential moving average of the weights and act with it
+    :param kv_cache: act on the keys and values kept of earlier steps instead of recomputing the window: several times
+        faster, and equal until the window slides (see :meth:`SequenceTrunk.extend`); can be set at any time
     :param seed: seed of the noise that acting starts from
     """
 
@@ -89,6 +91,7 @@ class SequencePolicy(BasePolicy):
         dropout: float = 0.1,
         weight_decay: float = 1e-3,
         ema: bool = False,
+        kv_cache: bool = False,
         seed: int | None = None,
     ) -> None:
         super().__init__(observation_space, action_space, normalize_images=False, optimizer_class=th.optim.AdamW)
@@ -100,6 +103,7 @@ class SequencePolicy(BasePolicy):
         self.dropout = dropout
         self.weight_decay = weight_decay
         self.ema = ema
+        self.kv_cache = kv_cache
         self.seed = seed
         self.observation_dim = int(observation_space["observation"].shape[0])  # type: ignore[index]
         self.action_dim = int(action_space.shape[0])
@@ -194,14 +198,13 @@ class SequencePolicy(BasePolicy):
 
         :return: (B, K, D), or (B, 1, D) of the newest steps with `last_only`
         """
-        normalized = (windows.observations - self.observation_mean) / self.observation_std
-        return network.trunk(
-            normalized.clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP),
-            windows.actions,
-            windows.returns_to_go / self.return_scale,
-            windows.timesteps,
-            windows.mask,
-            last_only,
+        return network.trunk(*self._normalized(windows), last_only)
+
+    def _normalized(self, windows: SequenceTensors) -> SequenceTensors:
+        observations = (windows.observations - self.observation_mean) / self.observation_std
+        return windows._replace(
+            observations=observations.clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP),
+            returns_to_go=windows.returns_to_go / self.return_scale,
         )
 
     def scaled_windows(self, batch: Any) -> SequenceTensors:
@@ -266,21 +269,47 @@ class SequencePolicy(BasePolicy):
         else:
             context = empty_context(n_rows, self.context_length, self.observation_dim, self.action_dim)
         context = push(context, *arrays, episode_start=episode_start)
-        scaled_action = self._act(context, deterministic)
-        context = with_action(context, scaled_action)
+        scaled_action, keys_values = self._act(context, deterministic)
+        context = with_action(context, scaled_action)._replace(keys_values=keys_values)
         if state is None:
             self._context = context
         action = np.clip(self.unscale_action(scaled_action), self.action_space.low, self.action_space.high)
         return action if vectorized else action.squeeze(axis=0), tuple(context)
 
-    def _act(self, context: Context, deterministic: bool) -> np.ndarray:
-        """The newest step's actions, (B, A) in [-1, 1]."""
+    def _act(self, context: Context, deterministic: bool) -> tuple[np.ndarray, np.ndarray]:
+        """The newest step's actions, (B, A) in [-1, 1], and the keys and values to keep."""
         self.set_training_mode(False)
         with th.inference_mode():
-            windows = SequenceTensors(*(th.from_numpy(array).to(self.device) for array in context))
-            hidden = self.hidden_states(self.acting_network, windows, last_only=True).squeeze(1)
+            *window, keys_values = (th.from_numpy(array).to(self.device) for array in context)
+            windows = SequenceTensors(*window)
+            if self.kv_cache and self.context_length > 1:
+                hidden, keys_values = self._extend(self._normalized(windows), keys_values)
+            else:
+                hidden = self.hidden_states(self.acting_network, windows, last_only=True).squeeze(1)
+                keys_values = keys_values.new_zeros(len(hidden), 0)
             noise = self._acting_noise(windows.timesteps[:, -1], deterministic)
-            return self._generate(hidden, noise).clamp(-1.0, 1.0).cpu().numpy()
+            actions = self._generate(hidden, noise).clamp(-1.0, 1.0)
+            return actions.cpu().numpy(), keys_values.cpu().numpy()
+
+    def _extend(self, windows: SequenceTensors, kept: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        The newest hidden states from what was kept, and what to keep for the next step.
+
+        :param windows: normalised
+        :param kept: (B, layers, 2, 3 (K - 1), D), or (B, 0) if the last steps were acted without a cache
+        :return: (B, D) hidden states, and the new `kept`
+        """
+        shape = (len(windows.mask), self.n_layers, 2, 3 * (self.context_length - 1), self.embed_dim)
+        trunk = self.acting_network.trunk
+        if kept.shape != shape:
+            kept = th.zeros(shape, device=self.device)
+            for n_missing in range(int(windows.mask.sum(dim=1).max()) - 1, 0, -1):
+                earlier = SequenceTensors(*(x.roll(n_missing, dims=1) for x in windows))
+                earlier.mask[:, :n_missing] = False  # the newest steps went round to the left
+                _, new = trunk.extend(*earlier, past=kept)
+                kept = th.cat((kept[:, :, :, 3:], new), dim=3)
+        hidden, new = trunk.extend(*windows, past=kept)
+        return hidden, th.cat((kept[:, :, :, 3:], new), dim=3)
 
     def _acting_noise(self, timestep: th.Tensor, deterministic: bool) -> th.Tensor:
         """
@@ -296,7 +325,8 @@ class SequencePolicy(BasePolicy):
         numbers = {key: value.cpu().numpy() for key, value in observation.items()}
         arrays, _ = unpack_observation(numbers, self.observation_dim)
         context = empty_context(len(arrays[0]), self.context_length, self.observation_dim, self.action_dim)
-        action = self.unscale_action(self._act(push(context, *arrays), deterministic))
+        scaled_action, _ = self._act(push(context, *arrays), deterministic)
+        action = self.unscale_action(scaled_action)
         return th.as_tensor(action, device=self.device)
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
@@ -312,6 +342,7 @@ class SequencePolicy(BasePolicy):
             "dropout",
             "weight_decay",
             "ema",
+            "kv_cache",
             "seed",
         )
         return dict(

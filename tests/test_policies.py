@@ -179,3 +179,68 @@ def test_a_state_of_other_environments_is_refused(model):
     batch = {key: np.stack([value] * 3) for key, value in observation.items()}
     with pytest.raises(ValueError, match="1 environments, the observation to 3"):
         model.predict(batch, state=state)
+
+
+def test_a_cache_gives_the_same_actions_until_the_window_slides(model):
+    exact = roll_plain(model, 5)
+    model.policy.kv_cache = True
+    assert np.allclose(roll_plain(model, 5), exact, atol=1e-4)
+    assert np.array_equal(roll_plain(model, 45), roll_with_state(model, 45))
+
+
+def test_a_cache_that_starts_in_mid_episode_is_filled_from_the_window(model):
+    """Also for rows whose episodes are of different ages."""
+    env = make_env()
+    observation, _ = env.reset(seed=0)
+    observations = {key: np.stack([value] * 2) for key, value in observation.items()}
+    states, actions = [], []
+    for kv_cache in (True, False):
+        model.policy.kv_cache = kv_cache
+        state = None
+        for t in range(4):
+            observations["timestep"][:] = [[t], [max(0, t - 2)]]
+            action, state = model.predict(
+                observations, state=state, episode_start=np.array([t == 0, t <= 2]), deterministic=True
+            )
+        states.append(state)
+    model.policy.kv_cache = True
+    observations["timestep"][:] = [[4], [2]]
+    for state in states:
+        actions.append(model.predict(observations, state=state, episode_start=np.zeros(2, bool), deterministic=True)[0])
+    assert np.allclose(*actions, atol=1e-4)
+
+
+def test_parallel_environments_with_a_cache_act_as_they_would_alone(model):
+    model.policy.kv_cache = True
+    test_parallel_environments_act_as_they_would_alone(model)
+
+
+def test_one_step_acting_is_one_evaluation_saved_with_the_model(cheetah_buffer, tmp_path):
+    policy_kwargs = {**TINY_FLOW_POLICY, "solver": "one_step", "kv_cache": True}
+    model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=policy_kwargs, batch_size=16, seed=0).learn(5)
+    model.save(tmp_path / "model.zip")
+    loaded = DTFM.load(tmp_path / "model.zip")
+    assert loaded.policy.solver == "one_step" and loaded.policy.kv_cache
+    assert np.array_equal(roll_plain(model, 8), roll_plain(loaded, 8))
+    model.policy.set_solver("euler", 10)
+    assert not np.allclose(roll_plain(model, 8), roll_plain(loaded, 8))
+
+
+def test_one_step_acting_needs_a_model_that_learned_it(cheetah_buffer):
+    policy_kwargs = {**TINY_FLOW_POLICY, "one_step": False}
+    model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=policy_kwargs, seed=0)
+    with pytest.raises(ValueError, match="one_step=True"):
+        model.policy.set_solver("one_step")
+
+
+def test_the_one_step_network_changes_nothing_else(cheetah_buffer):
+    weights = []
+    for one_step in (True, False):
+        policy_kwargs = {**TINY_FLOW_POLICY, "one_step": one_step, "dropout": 0.0}
+        model = DTFM(
+            "MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=policy_kwargs, batch_size=8, max_grad_norm=0.5, seed=0
+        ).learn(5)
+        weights.append({name: p for name, p in model.policy.network.named_parameters() if "jump" not in name})
+    with_it, without_it = weights
+    assert with_it.keys() == without_it.keys()
+    assert all(th.equal(with_it[name], without_it[name]) for name in with_it)

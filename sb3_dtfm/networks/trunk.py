@@ -26,30 +26,43 @@ class TransformerBlock(nn.Module):
     def forward(self, tokens: th.Tensor, attention_bias: th.Tensor, queries: slice = ALL) -> th.Tensor:
         """
         :param tokens: (B, L, D)
-        :param attention_bias: (B * heads, L, L), 0 where the query (second axis) may see the key (third), else -inf
+        :param attention_bias: (B, heads, L, L), 0 where the query (third axis) may see the key (fourth), else -inf
         :param queries: the Q tokens to compute; nothing is spent on the others beyond their keys and values
         :return: (B, Q, D)
         """
-        attended = self._attend(self.attention_norm(tokens), attention_bias[:, :, queries], queries)
-        tokens = dropout_add(tokens[:, queries], attended, self.dropout, self.training)
-        mapped = self.mlp_out(F.gelu(self.mlp_in(self.mlp_norm(tokens))))
-        return dropout_add(tokens, mapped, self.dropout, self.training)
-
-    def _attend(self, tokens: th.Tensor, attention_bias: th.Tensor, queries: slice) -> th.Tensor:
-        width = tokens.shape[-1]
+        normed, width = self.attention_norm(tokens), tokens.shape[-1]
         if queries == ALL:
-            query, key, value = self.attention_in(tokens).split(width, dim=-1)
+            query, key, value = self.attention_in(normed).split(width, dim=-1)
         else:
             weight, bias = self.attention_in.weight, self.attention_in.bias
-            query = F.linear(tokens[:, queries], weight[:width], bias[:width])
-            key, value = F.linear(tokens, weight[width:], bias[width:]).split(width, dim=-1)
-        dropout_p = self.dropout if self.training else 0.0
-        attended = attention(*map(self._split_heads, (query, key, value)), attention_bias, dropout_p)
-        return self.attention_out(attended.transpose(1, 2).flatten(start_dim=2))
+            query = F.linear(normed[:, queries], weight[:width], bias[:width])
+            key, value = F.linear(normed, weight[width:], bias[width:]).split(width, dim=-1)
+        return self._finish(tokens[:, queries], query, key, value, attention_bias[:, :, queries])
 
-    def _split_heads(self, tokens: th.Tensor) -> th.Tensor:
-        """From (B, L, D) to (B, heads, L, D / heads)."""
-        return tokens.unflatten(-1, (self.n_heads, -1)).transpose(1, 2)
+    def extend(self, tokens: th.Tensor, past: th.Tensor, attention_bias: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        Compute new tokens only, from the keys and values that earlier ones left behind.
+
+        :param tokens: (B, N, D), the new ones
+        :param past: (B, 2, P, D), keys and values of earlier tokens
+        :param attention_bias: (B, heads, N, P + N)
+        :return: (B, N, D), and keys and values of the new tokens, (B, 2, N, D)
+        """
+        query, key, value = self.attention_in(self.attention_norm(tokens)).split(tokens.shape[-1], dim=-1)
+        new = th.stack((key, value), dim=1)
+        key, value = th.cat((past, new), dim=2).unbind(dim=1)
+        return self._finish(tokens, query, key, value, attention_bias), new
+
+    def _finish(
+        self, tokens: th.Tensor, query: th.Tensor, key: th.Tensor, value: th.Tensor, attention_bias: th.Tensor
+    ) -> th.Tensor:
+        """Attend from the tokens' queries, (B, Q, D) each, to all keys and values, (B, L, D); then the MLP."""
+        dropout_p = self.dropout if self.training else 0.0
+        heads = (x.unflatten(-1, (self.n_heads, -1)).transpose(1, 2) for x in (query, key, value))
+        attended = attention(*heads, attention_bias, dropout_p).transpose(1, 2).flatten(start_dim=2)
+        tokens = dropout_add(tokens, self.attention_out(attended), self.dropout, self.training)
+        mapped = self.mlp_out(F.gelu(self.mlp_in(self.mlp_norm(tokens))))
+        return dropout_add(tokens, mapped, self.dropout, self.training)
 
 
 def attention(query: th.Tensor, key: th.Tensor, value: th.Tensor, bias: th.Tensor, dropout_p: float) -> th.Tensor:
@@ -143,25 +156,65 @@ class SequenceTrunk(nn.Module):
         :param last_only: compute the newest step's hidden state alone
         :return: (B, K, D) hidden states, (B, 1, D) with `last_only`
         """
-        batch, context_length = mask.shape
-        time = self.embed_timestep(timesteps.clamp(max=self.embed_timestep.num_embeddings - 1))
-        tokens = th.stack(
-            (
-                self.embed_return_to_go(returns_to_go.unsqueeze(-1)) + time,
-                self.embed_observation(observations) + time,
-                self.embed_action(actions) + time,
-            ),
-            dim=2,
-        ).view(batch, 3 * context_length, self.embed_dim)
-        tokens = dropout(tokens[:, :-1], self.dropout, self.training)  # nothing attends to the last action
-        allowed = causal_mask(mask.repeat_interleave(3, dim=1)[:, :-1])
-        attention_bias = th.zeros_like(allowed, dtype=tokens.dtype).masked_fill_(~allowed, -th.inf)
-        attention_bias = attention_bias.expand(-1, self.blocks[0].n_heads, -1, -1)
+        time = self._time(timesteps)
+        triples = (
+            self.embed_return_to_go(returns_to_go.unsqueeze(-1)) + time,
+            self.embed_observation(observations) + time,
+            self.embed_action(actions) + time,
+        )
+        tokens = th.stack(triples, dim=2).flatten(1, 2)[:, :-1]  # nothing attends to the last action
+        tokens = dropout(tokens, self.dropout, self.training)
+        attention_bias = self._attention_bias(causal_mask(mask.repeat_interleave(3, dim=1)[:, :-1]))
         *lower_blocks, last_block = self.blocks
         for block in lower_blocks:
             tokens = block(tokens, attention_bias)
         observation_tokens = slice(-1, None) if last_only else slice(1, None, 3)
         return self.final_norm(last_block(tokens, attention_bias, observation_tokens))
+
+    def extend(
+        self,
+        observations: th.Tensor,
+        actions: th.Tensor,
+        returns_to_go: th.Tensor,
+        timesteps: th.Tensor,
+        mask: th.Tensor,
+        past: th.Tensor,
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """
+        The newest step's hidden state from what earlier steps left behind: three new tokens instead of a whole window.
+
+        The new tokens are the last action, the return-to-go and the observation. They attend to the same steps as in
+        :meth:`forward`; but a kept step was itself computed with the steps before it, which reach back further than
+        this window once it slides. Equal to :meth:`forward` for the first K steps of an episode, and to attention with a
+        band of K steps over the whole episode from then on.
+
+        :param observations: (B, K, O), and the others as for :meth:`forward`; the last two steps are read
+        :param past: (B, layers, 2, 3 (K - 1), D), keys and values that the K - 1 calls before this one returned
+        :return: (B, D) hidden state, and the new tokens' keys and values (B, layers, 2, 3, D)
+        """
+        time = self._time(timesteps[:, -2:])
+        new = (
+            self.embed_action(actions[:, -2]) + time[:, 0],
+            self.embed_return_to_go(returns_to_go[:, -1:]) + time[:, 1],
+            self.embed_observation(observations[:, -1]) + time[:, 1],
+        )
+        tokens = th.stack(new, dim=1)
+        # In triples of action before, return-to-go, observation; the action before the oldest step is out of sight.
+        seen = th.stack((F.pad(mask[:, :-1], (1, 0)), mask, mask), dim=2).flatten(1)
+        attention_bias = self._attention_bias(causal_mask(seen)[:, :, -3:])
+        kept = []
+        for block, block_past in zip(self.blocks, past.unbind(dim=1), strict=True):
+            tokens, keys_values = block.extend(tokens, block_past, attention_bias)
+            kept.append(keys_values)
+        return self.final_norm(tokens[:, -1]), th.stack(kept, dim=1)
+
+    def _time(self, timesteps: th.Tensor) -> th.Tensor:
+        return self.embed_timestep(timesteps.clamp(max=self.embed_timestep.num_embeddings - 1))
+
+    def _attention_bias(self, allowed: th.Tensor) -> th.Tensor:
+        """From (B, 1, Q, L) bool to (B, heads, Q, L): what is added to the scores."""
+        bias = th.zeros_like(allowed, dtype=self.final_norm.weight.dtype).masked_fill_(~allowed, -th.inf)
+        return bias.expand(-1, self.blocks[0].n_heads, -1, -1)
 
 
 def causal_mask(valid: th.Tensor) -> th.Tensor:

@@ -104,3 +104,46 @@ def test_a_block_gives_each_query_what_it_gives_it_among_all(trunk, window):
     block = trunk.blocks[0]
     tokens, mask = th.randn(B, 7, 16), causal_mask(th.ones(B, 7, dtype=th.bool))
     assert th.allclose(block(tokens, mask, slice(1, None, 3)), block(tokens, mask)[:, 1::3], atol=1e-6)
+
+
+def keep_extending(trunk, window, n_steps):
+    """Hidden states of an episode's steps, each from three new tokens, with a window of K steps."""
+    batch, context_length = len(window["mask"]), K
+    kept = th.zeros(batch, trunk.n_layers, 2, 3 * (context_length - 1), trunk.embed_dim)
+    hidden_states = []
+    for step in range(n_steps):
+        first = max(0, step + 1 - context_length)
+        pad = context_length - (step + 1 - first)
+        seen = {key: value[:, first : step + 1] for key, value in window.items()}
+        padded = {
+            key: th.cat((th.zeros_like(value[:, :1].expand(-1, pad, *value.shape[2:])), value), 1)
+            for key, value in seen.items()
+        }
+        hidden, new = trunk.extend(**padded, past=kept)
+        kept = th.cat((kept[:, :, :, 3:], new), dim=3)
+        hidden_states.append(hidden)
+    return th.stack(hidden_states, dim=1)
+
+
+def test_kept_keys_and_values_change_nothing_until_the_window_slides(trunk, window):
+    assert th.allclose(keep_extending(trunk, window, K), trunk(**window), atol=1e-5)
+
+
+def test_kept_keys_and_values_are_attention_with_a_band_once_the_window_slides(trunk, monkeypatch):
+    """The same as one pass over the whole episode in which each token attends to the last K steps."""
+    length = 3 * K
+    generator = th.Generator().manual_seed(2)
+    episode = dict(
+        observations=th.randn(B, length, OBSERVATION_DIM, generator=generator),
+        actions=th.rand(B, length, A, generator=generator),
+        returns_to_go=th.randn(B, length, generator=generator),
+        timesteps=th.arange(length).repeat(B, 1),
+        mask=th.ones(B, length, dtype=th.bool),
+    )
+    extended = keep_extending(trunk, episode, length)
+    step, kind = th.arange(3 * length - 1) // 3, th.arange(3 * length - 1) % 3
+    reader = step + (kind == 2)  # an action is first read, and computed, with the step after it
+    band = (step[None] > reader[:, None] - K).unsqueeze(0).unsqueeze(0)
+    plain = causal_mask
+    monkeypatch.setattr("sb3_dtfm.networks.trunk.causal_mask", lambda valid: plain(valid) & band)
+    assert th.allclose(extended, trunk(**episode), atol=1e-5)
