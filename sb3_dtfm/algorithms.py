@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Callable
 from os import PathLike
 from typing import Any, ClassVar, TypeAlias, TypeVar
 
@@ -23,6 +24,7 @@ from sb3_dtfm.optimization import LEARNING_RATE_SCHEDULES, PRECISIONS, RunningMe
 from sb3_dtfm.policies import DTFMPolicy, DTPolicy, SequencePolicy
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineSequenceAlgorithm")
+LossFunction: TypeAlias = Callable[..., tuple[th.Tensor, dict[str, th.Tensor]]]
 Dataset: TypeAlias = str | PathLike[str] | minari.MinariDataset | TrajectoryBuffer
 
 
@@ -45,6 +47,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
     :param learning_rate_schedule: factor on the learning rate: "constant", or "linear" or "cosine" down to zero
     :param ema_decay: decay of the exponential moving average of weights that acts; 0 acts with the trained weights
     :param precision: "float32", "bfloat16" (autocast), or "auto": bfloat16 where the hardware multiplies in it
+    :param compile: compile the loss with `torch.compile`; None does so on a GPU. It takes a minute, and a C++ compiler
     :param policy_kwargs: arguments of the policy, for example `embed_dim`, `n_layers`, `n_heads`, `dropout`
     :param stats_window_size: as in SB3; offline learning collects no episodes
     :param tensorboard_log: folder of the TensorBoard log, None for no log
@@ -76,6 +79,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         learning_rate_schedule: str = "constant",
         ema_decay: float = 0.0,
         precision: str = "auto",
+        compile: bool | None = None,
         policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -109,6 +113,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         self.learning_rate_schedule = learning_rate_schedule
         self.ema_decay = ema_decay
         self.precision = precision
+        self.compile = compile
         self.max_timestep = 1000
         self.score_reference: ScoreReference | None = None
         self.buffer: TrajectoryBuffer | None = None
@@ -261,12 +266,12 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         generator = self._training_generator()
-        precision = autocast(self.precision, self.device)
+        compute_loss = self._loss_function()
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total_timesteps:
             step_start = time.perf_counter()
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
-            self._gradient_step(buffer, generator, precision)
+            self._gradient_step(buffer, generator, compute_loss)
             self.num_timesteps += 1
             self._training_seconds += time.perf_counter() - step_start
             if log_interval and (self.num_timesteps % log_interval == 0 or self.num_timesteps == total_timesteps):
@@ -277,13 +282,17 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         callback.on_training_end()
         return self
 
-    def _gradient_step(self, buffer: TrajectoryBuffer, generator: th.Generator, precision: th.autocast) -> None:
+    def _loss_function(self) -> LossFunction:
+        """The policy's loss in the precision asked for, compiled where that pays."""
+        compile_it = self.device.type == "cuda" if self.compile is None else self.compile
+        compute_loss = th.compile(self.policy.compute_loss) if compile_it else self.policy.compute_loss
+        return autocast(self.precision, self.device)(compute_loss)
+
+    def _gradient_step(self, buffer: TrajectoryBuffer, generator: th.Generator, compute_loss: LossFunction) -> None:
         self.policy.set_training_mode(True)  # an evaluation in between leaves evaluation mode on
         self._update_learning_rate(self.policy.optimizer)
         batch = buffer.sample(self.batch_size, self.context_length, generator)
-        noise = self.policy.draw_noise(batch, generator)
-        with precision:
-            loss, parts = self.policy.compute_loss(batch, *noise)
+        loss, parts = compute_loss(batch, *self.policy.draw_noise(batch, generator))
         self.policy.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.clipped_parameters(), self.max_grad_norm or math.inf)
@@ -391,6 +400,7 @@ class DTFM(OfflineSequenceAlgorithm):
         learning_rate_schedule: str = "constant",
         ema_decay: float = 0.0,
         precision: str = "auto",
+        compile: bool | None = None,
         regression_coef: float = 0.0,
         policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
@@ -417,6 +427,7 @@ class DTFM(OfflineSequenceAlgorithm):
             learning_rate_schedule=learning_rate_schedule,
             ema_decay=ema_decay,
             precision=precision,
+            compile=compile,
             policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,

@@ -54,11 +54,11 @@ def test_a_room_imports_only_the_rooms_below_it(room):
         assert rooms <= ROOMS[room][1], f"{path.relative_to(ROOT)} imports {sorted(own)}"
 
 
-def test_networks_need_torch_alone():
+def test_networks_need_torch_and_numpy_alone():
     standard = {"collections", "dataclasses", "math", "typing", "__future__", "abc", "functools"}
     for path in files("networks"):
         roots = {module.split(".")[0] for module in imported_modules(path)}
-        assert roots <= standard | {"torch", PACKAGE}, path
+        assert roots <= standard | {"torch", "numpy", PACKAGE}, path
 
 
 def test_every_module_belongs_to_a_room():

@@ -22,9 +22,9 @@ def keep_mask(like: th.Tensor, probability: float) -> th.Tensor:
     seed = int(th.randint(np.iinfo(np.int64).max, ()))
     raw = np.random.SFC64(seed).random_raw(-(-like.numel() // 4))
     bits = th.from_numpy(raw.view(np.int16))[: like.numel()].view(like.shape)
-    n_kept = round((1.0 - probability) * LEVELS)
+    n_kept = max(1, round((1.0 - probability) * LEVELS))
     mask = th.empty(like.shape, dtype=like.dtype)
-    th.lt(bits, n_kept - LEVELS // 2, out=mask)
+    th.le(bits, n_kept - 1 - LEVELS // 2, out=mask)  # bits are from -32768 to 32767
     return mask.mul_(LEVELS / n_kept)
 
 
@@ -36,11 +36,16 @@ def dropout(x: th.Tensor, probability: float, training: bool) -> th.Tensor:
     """
     if not training or probability == 0.0:
         return x
-    return x * keep_mask(x, probability) if x.device.type == "cpu" else F.dropout(x, probability)
+    return x * keep_mask(x, probability) if _draws_masks_here(x) else F.dropout(x, probability)
 
 
 def dropout_add(residual: th.Tensor, x: th.Tensor, probability: float, training: bool) -> th.Tensor:
     """`residual + dropout(x)`, in one pass where masks are factors."""
-    if not training or probability == 0.0 or x.device.type != "cpu":
+    if not training or probability == 0.0 or not _draws_masks_here(x):
         return residual + dropout(x, probability, training)
     return th.addcmul(residual, x, keep_mask(x, probability))
+
+
+def _draws_masks_here(x: th.Tensor) -> bool:
+    """A compiled graph draws its own, fused with what uses them."""
+    return x.device.type == "cpu" and not th.compiler.is_compiling()

@@ -1,0 +1,101 @@
+"""
+Measure DTFM; run by `compare.py`, each measurement in a process of its own.
+
+`python worker.py train WIDTH LAYERS N` or `python worker.py act WIDTH LAYERS N SOLVER SOLVER_STEPS KV_CACHE N_ENVS` prints
+one line of JSON.
+"""
+
+import json
+import resource
+import statistics
+import sys
+import time
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+import sb3_dtfm
+from sb3_dtfm import DTFM
+from sb3_dtfm.data import Trajectory, TrajectoryBuffer
+
+OBSERVATION_DIM, ACTION_DIM, BATCH_SIZE, CONTEXT_LENGTH = 17, 6, 64, 20
+
+
+def make_model(width: int, n_layers: int, **policy_kwargs: object) -> DTFM:
+    """DTFM at its defaults but for the size; the flow head of the small profile is half as wide."""
+    rng = np.random.default_rng(0)
+    episodes = [
+        Trajectory(rng.normal(size=(1000, OBSERVATION_DIM)), rng.uniform(-1, 1, (1000, ACTION_DIM)), rng.normal(size=1000))
+        for _ in range(10)
+    ]
+    dataset = TrajectoryBuffer.from_trajectories(episodes, spaces.Box(-1, 1, (ACTION_DIM,)))
+    sizes = dict(embed_dim=width, n_layers=n_layers, flow_hidden_dim=2 * width)
+    return DTFM(
+        "MultiInputPolicy",
+        dataset=dataset,
+        batch_size=BATCH_SIZE,
+        context_length=CONTEXT_LENGTH,
+        policy_kwargs={**sizes, **policy_kwargs},
+        device="cpu",
+        seed=0,
+    )
+
+
+def train(width: int, n_layers: int, n_steps: int) -> dict[str, float]:
+    """Median of the time between two steps of `learn`, its sampling included, and the share of the sampling."""
+    model = make_model(width, n_layers)
+    stamps = []
+    model.learn(
+        n_steps + 2,
+        callback=lambda *_: stamps.append((time.perf_counter(), time.process_time())) is None,
+        log_interval=None,
+    )
+    wall, processor = (statistics.median(column) * 1e3 for column in np.diff(stamps[1:], axis=0).T)
+    generator = th.Generator()
+    sampling = median_ms(lambda: model.buffer.sample(BATCH_SIZE, CONTEXT_LENGTH, generator), 200)
+    return {"wall_ms": wall, "processor_ms": processor, "sampling_ms": sampling}
+
+
+def act(
+    width: int, n_layers: int, n: int, solver: str, n_solver_steps: int, kv_cache: bool, n_envs: int
+) -> dict[str, float]:
+    """Median time of `predict` with a full context."""
+    model = make_model(width, n_layers, solver=solver, n_solver_steps=n_solver_steps, kv_cache=kv_cache)
+    rng = np.random.default_rng(0)
+    state, times = None, []
+    for t in range(CONTEXT_LENGTH + n):
+        observation = {
+            "observation": rng.normal(size=(n_envs, OBSERVATION_DIM)).astype(np.float32),
+            "return_to_go": np.ones((n_envs, 1), np.float32),
+            "timestep": np.full((n_envs, 1), t),
+        }
+        start = time.perf_counter()
+        _, state = model.predict(observation, state=state, deterministic=True)
+        times.append(time.perf_counter() - start)
+    return {"wall_ms": statistics.median(times[CONTEXT_LENGTH:]) * 1e3}
+
+
+def median_ms(function, n: int) -> float:  # noqa: ANN001
+    """Median time of a call in milliseconds."""
+    times = []
+    for _ in range(n):
+        start = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times) * 1e3
+
+
+def main() -> None:
+    what, width, n_layers, n = sys.argv[1], *map(int, sys.argv[2:5])
+    if what == "train":
+        result = train(width, n_layers, n)
+    else:
+        solver, n_solver_steps, kv_cache, n_envs = sys.argv[5], *map(int, sys.argv[6:9])
+        result = act(width, n_layers, n, solver, n_solver_steps, bool(kv_cache), n_envs)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(json.dumps({**result, "peak_mib": peak, "version": sb3_dtfm.__version__, "torch": th.__version__}))
+
+
+if __name__ == "__main__":
+    main()
