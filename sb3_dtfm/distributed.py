@@ -105,9 +105,17 @@ class DataParallel:
         if self.n_processes == 1:
             return self.policy.compute_loss(batch, *noise)
         share = type(batch)(*(tensor[self._rows] for tensor in batch))
-        weight = self.n_processes * share.mask.sum() / batch.mask.sum()
         loss, parts = self._policy_loss(share, *(tensor[self._rows] for tensor in noise))
-        return weight * loss, {name: weight * part for name, part in parts.items()}
+        weight = self._weight(batch.mask)
+        loss, weighted = weight * loss, {name: weight * part for name, part in parts.items()}
+        for name, mask in self.policy.part_masks(batch.mask).items():
+            weighted[name] = self._weight(mask) * parts[name]
+            loss = loss + weighted[name] - weight * parts[name]
+        return loss, weighted
+
+    def _weight(self, mask: th.Tensor) -> th.Tensor:
+        """What a mean over this process's valid steps counts, so that the mean over the processes is that over all steps."""
+        return self.n_processes * mask[self._rows].sum() / mask.sum()
 
     def mean(self, values: dict[str, th.Tensor]) -> dict[str, th.Tensor]:
         """

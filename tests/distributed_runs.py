@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import torch as th
@@ -11,6 +12,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
+from sb3_dtfm.networks import trunk
+from sb3_dtfm.networks.dropout import dropout
 from tests.conftest import TINY_FLOW_POLICY, TINY_POLICY
 
 ALGORITHMS = {"DT": (DT, TINY_POLICY), "DTFM": (DTFM, {**TINY_FLOW_POLICY, "regression_coef": 0.5})}
@@ -66,13 +69,15 @@ def run_without_a_seed() -> dict:
         drawn.append(sample(*args))
         return drawn[-1]
 
-    def record_dropout(_module, _inputs, output):
+    def recording_dropout(tokens, probability, training):
+        output = dropout(tokens, probability, training)
         dropped.append(output.detach() == 0)
+        return output
 
     model.buffer.sample = recording_sample
-    model.policy.network.trunk.embedding_dropout.register_forward_hook(record_dropout)
     callback = StopAt(5)
-    model.learn(50, callback=callback, log_interval=None)
+    with patch.object(trunk, "dropout", recording_dropout):
+        model.learn(50, callback=callback, log_interval=None)
     return {
         "batches": [tuple(batch) for batch in drawn],
         "dropped": dropped,
