@@ -119,7 +119,7 @@ class DataParallel:
 
     def mean(self, values: dict[str, th.Tensor]) -> dict[str, th.Tensor]:
         """
-        Means over the processes, on their device: nothing waits for the result.
+        Means over the processes; with GPUs, one more kernel in the queue that no host waits for.
 
         :param values: scalars by name, the same names on every process
         """
