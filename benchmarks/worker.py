@@ -10,6 +10,7 @@ import resource
 import statistics
 import sys
 import time
+from collections.abc import Callable
 
 import numpy as np
 import torch as th
@@ -76,7 +77,7 @@ def act(
     return {"wall_ms": statistics.median(times[CONTEXT_LENGTH:]) * 1e3}
 
 
-def median_ms(function, n: int) -> float:  # noqa: ANN001
+def median_ms(function: Callable[[], object], n: int) -> float:
     """Median time of a call in milliseconds."""
     times = []
     for _ in range(n):

@@ -1,9 +1,11 @@
 """`DT` and `DTFM`: one offline learn loop, two policies."""
 
+import io
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Iterable
 from os import PathLike
+from pathlib import Path
 from typing import Any, ClassVar, TypeAlias, TypeVar
 
 import minari
@@ -19,12 +21,18 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dtfm.callbacks import GradientStepProgressBar, NormalizedScoreCallback, find_eval_callbacks
 from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer, load_dataset
+from sb3_dtfm.distributed import (
+    DataParallel,
+    LossFunction,
+    check_batch_size,
+    first_of_each_machine_first,
+    is_first_process,
+)
 from sb3_dtfm.envs import check_vec_env, return_to_go_space
 from sb3_dtfm.optimization import LEARNING_RATE_SCHEDULES, PRECISIONS, RunningMeans, autocast, learning_rate_factor
 from sb3_dtfm.policies import DTFMPolicy, DTPolicy, SequencePolicy
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineSequenceAlgorithm")
-LossFunction: TypeAlias = Callable[..., tuple[th.Tensor, dict[str, th.Tensor]]]
 Dataset: TypeAlias = str | PathLike[str] | minari.MinariDataset | TrajectoryBuffer
 
 
@@ -32,11 +40,14 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
     """
     Learn a sequence policy from recorded episodes: `learn(total_timesteps)` counts gradient steps.
 
+    Where `torch.distributed` is initialised, its processes train one model together; callbacks, logs and `save` are those
+    of process 0.
+
     :param policy: "MultiInputPolicy" or a policy class
     :param env: environment wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`; optional, never used for learning
     :param dataset: Minari id or dataset, path to a robomimic hdf5 file, or a :class:`~sb3_dtfm.data.TrajectoryBuffer`
     :param learning_rate: AdamW's, a number or a function of the progress remaining (from 1 to 0)
-    :param batch_size: windows in a gradient step
+    :param batch_size: windows in a gradient step, of all processes together
     :param weight_decay: AdamW's, on weight matrices only
     :param context_length: K, steps the policy sees
     :param dataset_fraction: share of the episodes to learn from, randomly drawn
@@ -137,6 +148,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
         if not 0.0 <= self.ema_decay < 1.0:
             raise ValueError(f"ema_decay must lie in [0, 1), got {self.ema_decay}.")
+        check_batch_size(self.batch_size)
 
     def set_dataset(self, dataset: Dataset) -> None:
         """
@@ -156,7 +168,8 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
                 f"{name} has no dataset to learn from: give one to the constructor, or to a loaded model by "
                 f"{name}.load(path, dataset=...) or model.set_dataset(...)."
             )
-        buffer = load_dataset(self.dataset, **(self.dataset_kwargs or {}))
+        with first_of_each_machine_first():
+            buffer = load_dataset(self.dataset, **(self.dataset_kwargs or {}))
         observation_space = return_to_go_space(buffer.observation_space)
         if getattr(self, "observation_space", None) is None:
             self.observation_space, self.action_space, self.n_envs = observation_space, buffer.action_space, 1
@@ -203,6 +216,8 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         return vec_env
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        if not is_first_process():
+            callback, progress_bar = None, False
         if isinstance(callback, list):
             callback = CallbackList(callback)
         evaluations = find_eval_callbacks(callback) if isinstance(callback, BaseCallback) else []
@@ -236,7 +251,8 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         self._num_timesteps_at_start = self.num_timesteps
         self._means, self._training_seconds = RunningMeans(), 0.0
         if not self._custom_logger:
-            self._logger = configure_logger(self.verbose, self.tensorboard_log, tb_log_name, reset_num_timesteps)
+            verbose, folder = (self.verbose, self.tensorboard_log) if is_first_process() else (0, None)
+            self._logger = configure_logger(verbose, folder, tb_log_name, reset_num_timesteps)
         return total_timesteps, self._init_callback(callback, progress_bar)
 
     def learn(
@@ -250,6 +266,8 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
     ) -> SelfAlgorithm:
         """
         Train for `total_timesteps` gradient steps; callbacks run once after each.
+
+        Of several processes, all call this alike, and the callbacks run on process 0; it stops all when they stop it.
 
         :param total_timesteps: gradient steps
         :param callback: SB3 callback or list of callbacks
@@ -265,21 +283,22 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
-        generator = self._training_generator()
-        compute_loss = self._loss_function()
+        parallel = DataParallel(self.policy, self._loss_function(), self.batch_size)
+        generator = self._training_generator(parallel)
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total_timesteps:
             step_start = time.perf_counter()
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
-            self._gradient_step(buffer, generator, compute_loss)
+            self._gradient_step(buffer, generator, parallel)
             self.num_timesteps += 1
             self._training_seconds += time.perf_counter() - step_start
             if log_interval and (self.num_timesteps % log_interval == 0 or self.num_timesteps == total_timesteps):
                 self.dump_logs()
             callback.update_locals(locals())
-            if not callback.on_step():
+            if not parallel.from_first(callback.on_step()):
                 break
         callback.on_training_end()
+        parallel.close()
         return self
 
     def _loss_function(self) -> LossFunction:
@@ -288,11 +307,11 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         compute_loss = th.compile(self.policy.compute_loss) if compile_it else self.policy.compute_loss
         return autocast(self.precision, self.device)(compute_loss)
 
-    def _gradient_step(self, buffer: TrajectoryBuffer, generator: th.Generator, compute_loss: LossFunction) -> None:
+    def _gradient_step(self, buffer: TrajectoryBuffer, generator: th.Generator, parallel: DataParallel) -> None:
         self.policy.set_training_mode(True)  # an evaluation in between leaves evaluation mode on
         self._update_learning_rate(self.policy.optimizer)
         batch = buffer.sample(self.batch_size, self.context_length, generator)
-        loss, parts = compute_loss(batch, *self.policy.draw_noise(batch, generator))
+        loss, parts = parallel.compute_loss(batch, *self.policy.draw_noise(batch, generator))
         self.policy.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.clipped_parameters(), self.max_grad_norm or math.inf)
@@ -301,7 +320,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         if self.ema_decay > 0:
             # A young average follows more closely, or the random start would stay in it for long.
             self.policy.update_ema(min(self.ema_decay, (1 + self._n_updates) / (10 + self._n_updates)))
-        self._means.add({"loss": loss, "grad_norm": grad_norm, **parts})
+        self._means.add(parallel.mean({"loss": loss, "grad_norm": grad_norm, **parts}))
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         remaining = self._current_progress_remaining
@@ -310,15 +329,14 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         for optimizer in optimizers if isinstance(optimizers, list) else [optimizers]:
             update_learning_rate(optimizer, self._current_learning_rate)
 
-    def _training_generator(self) -> th.Generator:
+    def _training_generator(self, parallel: DataParallel) -> th.Generator:
         """Randomness of batches and losses: the run's own, and another stream where training is continued."""
         generator = th.Generator(self.device)
         if self.seed is None:
-            generator.seed()
+            seed = generator.seed()
         else:
-            entropy = np.random.SeedSequence([self.seed, self.num_timesteps])
-            generator.manual_seed(int(entropy.generate_state(1, np.uint64)[0]))
-        return generator
+            seed = int(np.random.SeedSequence([self.seed, self.num_timesteps]).generate_state(1, np.uint64)[0])
+        return generator.manual_seed(parallel.seed(seed))
 
     def dump_logs(self) -> None:
         """
@@ -335,6 +353,11 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
                 f"The loss became {means['loss']} within the {n_steps} gradient steps before step {self.num_timesteps}. "
                 "Try a lower learning_rate, warmup_steps or max_grad_norm."
             )
+        if is_first_process():
+            self._log(means, n_steps)
+        self._training_seconds = 0.0
+
+    def _log(self, means: dict[str, float], n_steps: int) -> None:
         for name, mean in means.items():
             self.logger.record(f"train/{name}", mean)
         self.logger.record("train/action_mse", self._training_action_mse())
@@ -344,7 +367,6 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         self.logger.record("time/time_elapsed", int((time.time_ns() - self.start_time) / 1e9), exclude="tensorboard")
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(step=self.num_timesteps)
-        self._training_seconds = 0.0
 
     def _training_action_mse(self) -> float:
         """`train/action_mse` on windows of the training data that belong to the step, so that it disturbs nothing."""
@@ -352,6 +374,22 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         generator = th.Generator(self.device).manual_seed(self.num_timesteps)
         batch = self.buffer.sample(self.batch_size, self.context_length, generator)
         return float(self.policy.action_mse(batch, generator))
+
+    def save(
+        self,
+        path: str | Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        SB3's saving, on process 0 only: the others hold the same model, and would write the same file at the same time.
+
+        :param path: file to write
+        :param exclude: attributes to leave out beside the default ones
+        :param include: attributes to save although they are left out by default
+        """
+        if is_first_process():
+            super().save(path, exclude, include)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "dataset", "buffer", "_means"]

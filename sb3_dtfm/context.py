@@ -16,8 +16,8 @@ class Context(NamedTuple):
     Windows of B environments, newest step last, padded on the left.
 
     Shapes: observations (B, K, O) as the environment gives them, actions (B, K, A) in [-1, 1], returns_to_go (B, K) in
-    environment reward units, timesteps (B, K) int64, mask (B, K) bool, False on padded steps, keys_values (B, ...), what the policy
-    keeps of its earlier computation, (B, 0) if nothing.
+    environment reward units, timesteps (B, K) int64, mask (B, K) bool, False on padded steps, keys_values (B, ...), what the
+    policy keeps of its earlier computation, (B, 0) if nothing.
     """
 
     observations: np.ndarray

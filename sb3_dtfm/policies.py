@@ -142,6 +142,15 @@ class SequencePolicy(BasePolicy):
         """
         return ()
 
+    def part_masks(self, mask: th.Tensor) -> dict[str, th.Tensor]:
+        """
+        Parts of the loss that are means over some of the valid steps only; each is a plain summand of the loss.
+
+        :param mask: (B, K) bool, of a batch
+        :return: the steps of such a part (B, ...) bool, by its logged name
+        """
+        return {}
+
     @abstractmethod
     def compute_loss(self, batch: Any, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """
@@ -447,6 +456,9 @@ class DTFMPolicy(SequencePolicy):
             parts["one_step_loss"] = head.one_step_loss(hidden[:, newest], windows.mask[:, newest], starts[:, newest])
             loss = loss + parts["one_step_loss"]
         return loss, parts
+
+    def part_masks(self, mask: th.Tensor) -> dict[str, th.Tensor]:
+        return {"one_step_loss": mask[:, -ONE_STEP_POSITIONS:]} if self.one_step else {}
 
     def clipped_parameters(self) -> list[nn.Parameter]:
         """All but the one-step network's: it must not change how the others are clipped."""

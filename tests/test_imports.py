@@ -17,8 +17,9 @@ ROOMS = {
     "policies": ("sb3_dtfm/policies.py", {"networks", "context"}),
     "callbacks": ("sb3_dtfm/callbacks.py", {"data"}),
     "optimization": ("sb3_dtfm/optimization.py", set()),
-    "algorithms": ("sb3_dtfm/algorithms.py", {"policies", "data", "envs", "callbacks", "optimization"}),
-    "zoo": ("sb3_dtfm/zoo", {"", "data", "envs", "zoo"}),
+    "distributed": ("sb3_dtfm/distributed.py", set()),
+    "algorithms": ("sb3_dtfm/algorithms.py", {"policies", "data", "envs", "callbacks", "optimization", "distributed"}),
+    "zoo": ("sb3_dtfm/zoo", {"", "data", "envs", "distributed", "zoo"}),
 }
 
 

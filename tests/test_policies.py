@@ -199,9 +199,7 @@ def test_a_cache_that_starts_in_mid_episode_is_filled_from_the_window(model):
         state = None
         for t in range(4):
             observations["timestep"][:] = [[t], [max(0, t - 2)]]
-            action, state = model.predict(
-                observations, state=state, episode_start=np.array([t == 0, t <= 2]), deterministic=True
-            )
+            _, state = model.predict(observations, state=state, episode_start=np.array([t == 0, t <= 2]), deterministic=True)
         states.append(state)
     model.policy.kv_cache = True
     observations["timestep"][:] = [[4], [2]]
@@ -220,7 +218,8 @@ def test_one_step_acting_is_one_evaluation_saved_with_the_model(cheetah_buffer, 
     model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=policy_kwargs, batch_size=16, seed=0).learn(5)
     model.save(tmp_path / "model.zip")
     loaded = DTFM.load(tmp_path / "model.zip")
-    assert loaded.policy.solver == "one_step" and loaded.policy.kv_cache
+    assert loaded.policy.solver == "one_step"
+    assert loaded.policy.kv_cache
     assert np.array_equal(roll_plain(model, 8), roll_plain(loaded, 8))
     model.policy.set_solver("euler", 10)
     assert not np.allclose(roll_plain(model, 8), roll_plain(loaded, 8))

@@ -58,8 +58,8 @@ class TransformerBlock(nn.Module):
     ) -> th.Tensor:
         """Attend from the tokens' queries, (B, Q, D) each, to all keys and values, (B, L, D); then the MLP."""
         dropout_p = self.dropout if self.training else 0.0
-        heads = (x.unflatten(-1, (self.n_heads, -1)).transpose(1, 2) for x in (query, key, value))
-        attended = attention(*heads, attention_bias, dropout_p).transpose(1, 2).flatten(start_dim=2)
+        query, key, value = (x.unflatten(-1, (self.n_heads, -1)).transpose(1, 2) for x in (query, key, value))
+        attended = attention(query, key, value, attention_bias, dropout_p).transpose(1, 2).flatten(start_dim=2)
         tokens = dropout_add(tokens, self.attention_out(attended), self.dropout, self.training)
         mapped = self.mlp_out(F.gelu(self.mlp_in(self.mlp_norm(tokens))))
         return dropout_add(tokens, mapped, self.dropout, self.training)
@@ -119,6 +119,7 @@ class SequenceTrunk(nn.Module):
             raise ValueError(f"n_layers must be at least 1, got {n_layers}.")
         self.embed_dim = embed_dim
         self.n_layers = n_layers
+        self.n_heads = n_heads
         self.embed_return_to_go = nn.Linear(1, embed_dim)
         self.embed_observation = nn.Linear(observation_dim, embed_dim)
         self.embed_action = nn.Linear(action_dim, embed_dim)
@@ -204,6 +205,7 @@ class SequenceTrunk(nn.Module):
         attention_bias = self._attention_bias(causal_mask(seen)[:, :, -3:])
         kept = []
         for block, block_past in zip(self.blocks, past.unbind(dim=1), strict=True):
+            assert isinstance(block, TransformerBlock)
             tokens, keys_values = block.extend(tokens, block_past, attention_bias)
             kept.append(keys_values)
         return self.final_norm(tokens[:, -1]), th.stack(kept, dim=1)
@@ -214,7 +216,7 @@ class SequenceTrunk(nn.Module):
     def _attention_bias(self, allowed: th.Tensor) -> th.Tensor:
         """From (B, 1, Q, L) bool to (B, heads, Q, L): what is added to the scores."""
         bias = th.zeros_like(allowed, dtype=self.final_norm.weight.dtype).masked_fill_(~allowed, -th.inf)
-        return bias.expand(-1, self.blocks[0].n_heads, -1, -1)
+        return bias.expand(-1, self.n_heads, -1, -1)
 
 
 def causal_mask(valid: th.Tensor) -> th.Tensor:

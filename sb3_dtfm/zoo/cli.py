@@ -17,12 +17,14 @@ def train(argv: Sequence[str]) -> None:
 
     from sb3_dtfm.zoo.arguments import train_arguments, train_parser
     from sb3_dtfm.zoo.registration import register
+    from sb3_dtfm.zoo.torchrun import joined_processes
 
     register()
     if {"-h", "--help"} & set(argv):
         train_parser().print_help()
         _run_with_arguments(zoo_train, "train", ["--help"])
-    _run_with_arguments(zoo_train, "train", train_arguments(argv))
+    with joined_processes(train_arguments(argv)) as arguments:
+        _run_with_arguments(zoo_train, "train", arguments)
 
 
 def enjoy(argv: Sequence[str]) -> None:

@@ -1,0 +1,116 @@
+"""`torchrun -m sb3_dtfm train`: process 0 does what RL-Zoo does; the others train along and write nothing."""
+
+import argparse
+import contextlib
+import os
+import signal
+from collections.abc import Iterator, Sequence
+from typing import Any, NoReturn
+
+import rl_zoo3.train
+import torch as th
+import torch.distributed as dist
+from rl_zoo3.exp_manager import ExperimentManager
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_dtfm.distributed import is_first_process
+from sb3_dtfm.zoo.arguments import UsageError
+from sb3_dtfm.zoo.registration import OFFLINE_ALGORITHMS
+
+
+@contextlib.contextmanager
+def joined_processes(arguments: Sequence[str]) -> Iterator[list[str]]:
+    """
+    Join the processes that torchrun started, for one training; where there is one process, nothing happens.
+
+    A process that fails leaves without a word to the others: torchrun ends them.
+
+    :param arguments: for RL-Zoo's `train`
+    :return: arguments for `train` on this process
+    :raises UsageError: several processes cannot do this together
+    """
+    if "RANK" not in os.environ or int(os.environ.get("WORLD_SIZE", 1)) == 1:
+        yield list(arguments)
+        return
+    options = _options(arguments)
+    _check(options)
+    if options.device != "cpu" and th.cuda.is_available():
+        _take_own_gpu()
+    dist.init_process_group()  # gloo for the CPU, NCCL for GPUs
+    if is_first_process():
+        signal.signal(signal.SIGINT, _interrupt_once)
+        yield list(arguments)
+    else:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # or process 0 would wait for this one, and could not save
+        with _training_along():
+            yield [argument for argument in arguments if argument != "--track"]
+    dist.destroy_process_group()
+
+
+def _options(arguments: Sequence[str]) -> argparse.Namespace:
+    """Those of RL-Zoo's options that matter here."""
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--algo")
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("-optimize", "--optimize-hyperparameters", action="store_true")
+    return parser.parse_known_args(arguments)[0]
+
+
+def _check(options: argparse.Namespace) -> None:
+    if options.algo not in OFFLINE_ALGORITHMS:
+        raise UsageError(f"torchrun trains {' and '.join(OFFLINE_ALGORITHMS)} on several processes, not {options.algo}.")
+    if options.optimize_hyperparameters:
+        raise UsageError(
+            "-optimize: processes of a search share a --storage and a --study-name; start each by itself, not with torchrun."
+        )
+
+
+def _take_own_gpu() -> None:
+    """From here on, "cuda" is the GPU of this process."""
+    rank, n_gpus = int(os.environ["LOCAL_RANK"]), th.cuda.device_count()
+    if rank >= n_gpus:
+        raise UsageError(
+            f"torchrun --nproc-per-node: this machine has {n_gpus} GPUs, one for each process (or --device cpu)."
+        )
+    th.cuda.set_device(rank)
+
+
+def _interrupt_once(*_: Any) -> NoReturn:
+    """
+    Ctrl-C reaches a process twice, from the terminal and from torchrun.
+
+    :raises KeyboardInterrupt: on which RL-Zoo saves the model; the second one must not interrupt that
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    raise KeyboardInterrupt
+
+
+class TrainAlongManager(ExperimentManager):
+    """RL-Zoo's way to a trained model, without its folder, its files and its callbacks."""
+
+    def create_log_folder(self) -> None:
+        pass
+
+    def create_callbacks(self) -> None:
+        self.callbacks = []
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        return super().create_envs(n_envs, eval_env, no_log=True)
+
+    def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
+        pass
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        pass
+
+
+@contextlib.contextmanager
+def _training_along() -> Iterator[None]:
+    """RL-Zoo's `train` without a trace: neither files nor prints."""
+    rl_zoo3.train.ExperimentManager = TrainAlongManager  # type: ignore[misc]
+    try:
+        with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+            yield
+    finally:
+        rl_zoo3.train.ExperimentManager = ExperimentManager  # type: ignore[misc]
