@@ -1,0 +1,128 @@
+"""
+DTFM beside its peer d3rlpy, in turn on one machine: `make benchmark`.
+
+Prints docs/performance.md's tables of training and acting: medians over repeats, each in a process of its own, and ratios
+of the medians. Peers come from PyPI in an environment of their own.
+"""
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import torch as th
+from torch.utils.flop_counter import FlopCounterMode
+from worker import BATCH_SIZE, CONTEXT_LENGTH, make_model
+
+HERE = Path(__file__).parent
+SIZES = {"width 128, 3 layers": (128, 3, 15), "width 256, 10 layers": (256, 10, 5)}
+N_ACTIONS = 100
+# Name: solver, its steps, keys and values kept, environments.
+ACTING = {
+    "50 Euler steps": ("euler", 50, 0, 1),
+    "10 Euler steps": ("euler", 10, 0, 1),
+    "one step": ("one_step", 1, 0, 1),
+    "50 Euler steps, kv_cache": ("euler", 50, 1, 1),
+    "10 Euler steps, kv_cache": ("euler", 10, 1, 1),
+    "one step, kv_cache": ("one_step", 1, 1, 1),
+    "50 Euler steps, kv_cache, 16 environments": ("euler", 50, 1, 16),
+    "one step, kv_cache, 16 environments": ("one_step", 1, 1, 16),
+    "one step, 16 environments": ("one_step", 1, 0, 16),
+}
+
+
+def measure(python: str, worker: str, *arguments: object) -> dict[str, float]:
+    """One measurement in a fresh process."""
+    command = [python, str(HERE / worker), *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        sys.exit(f"{' '.join(command)} failed:\n{done.stderr}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def medians(runs: list[dict[str, float]]) -> dict[str, float]:
+    return {key: statistics.median(run[key] for run in runs) for key in runs[0] if not isinstance(runs[0][key], str)}
+
+
+def matrix_flops(width: int, n_layers: int) -> float:
+    """Floating-point operations of one gradient step's matrix products, counted by torch."""
+    model = make_model(width, n_layers)
+    model.policy.set_training_mode(True)
+    generator = th.Generator().manual_seed(0)
+    batch = model.buffer.sample(BATCH_SIZE, CONTEXT_LENGTH, generator)
+    with FlopCounterMode(display=False) as counter:
+        loss, _ = model.policy.compute_loss(batch, *model.policy.draw_noise(batch, generator))
+        loss.backward()
+    return counter.get_total_flops()
+
+
+def matrix_rate() -> float:
+    """Floating-point operations a second of a float32 product large enough to be at the machine's limit."""
+    a, b = th.randn(2048, 2048), th.randn(2048, 2048)
+    times = []
+    for _ in range(15):
+        start = time.perf_counter()
+        th.mm(a, b)
+        times.append(time.perf_counter() - start)
+    return 2 * 2048**3 / min(times)
+
+
+def training_table(peer_python: str, repeats: int) -> None:
+    print("| training | d3rlpy DT, ms | DTFM, ms | d3rlpy / DTFM | bound, ms | of the bound | sampling | peak MiB, both |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    for name, (width, n_layers, n_steps) in SIZES.items():
+        peers, ours, rates = [], [], []
+        for _ in range(repeats):
+            rates.append(matrix_rate())
+            peers.append(measure(peer_python, "d3rlpy_worker.py", "train", width, n_layers, n_steps))
+            ours.append(measure(sys.executable, "worker.py", "train", width, n_layers, n_steps))
+        peer, our = medians(peers), medians(ours)
+        bound = matrix_flops(width, n_layers) / statistics.median(rates) * 1e3
+        print(
+            f"| {name} | {peer['wall_ms']:.0f} | {our['wall_ms']:.0f} | {peer['wall_ms'] / our['wall_ms']:.2f} "
+            f"| {bound:.0f} | {bound / our['wall_ms']:.0%} | {our['sampling_ms'] / our['wall_ms']:.1%} "
+            f"| {peer['peak_mib']:.0f}, {our['peak_mib']:.0f} |",
+            flush=True,
+        )
+    print(
+        f"\nBound: matrix products alone, at the {statistics.median(rates) / 1e9:.0f} GFLOP/s of a large float32 product.\n"
+    )
+
+
+def acting_table(peer_python: str, repeats: int) -> None:
+    print("| acting, width 256, 10 layers | ms | of d3rlpy's |")
+    print("| --- | --- | --- |")
+    runs: dict[str, list[dict[str, float]]] = {name: [] for name in ("d3rlpy DT", *ACTING)}
+    for _ in range(repeats):
+        runs["d3rlpy DT"].append(measure(peer_python, "d3rlpy_worker.py", "act", 256, 10, N_ACTIONS))
+        for name, setting in ACTING.items():
+            runs[name].append(measure(sys.executable, "worker.py", "act", 256, 10, N_ACTIONS, *setting))
+    times = {name: medians(results)["wall_ms"] for name, results in runs.items()}
+    for name, milliseconds in times.items():
+        print(f"| {name} | {milliseconds:.1f} | {milliseconds / times['d3rlpy DT']:.2f} |")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--peer-python", required=True, help="Python of an environment with d3rlpy and the same torch")
+    parser.add_argument("--repeats", type=int, default=3)
+    options = parser.parse_args()
+    os.environ.setdefault("OMP_WAIT_POLICY", "ACTIVE")  # the machine is the benchmark's alone: torch's own default, for both
+    commit = subprocess.run(
+        ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, cwd=HERE, check=False
+    )
+    print(f"torch {th.__version__}, {th.get_num_threads()} threads, {platform.processor() or platform.machine()}, ", end="")
+    print(
+        f"{th.backends.cpu.get_cpu_capability()}, commit {commit.stdout.strip()}, batch {BATCH_SIZE}, K = {CONTEXT_LENGTH}\n"
+    )
+    training_table(options.peer_python, options.repeats)
+    acting_table(options.peer_python, options.repeats)
+
+
+if __name__ == "__main__":
+    main()
