@@ -120,7 +120,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
             self.max_timestep = int(buffer.episode_lengths.max())
             self.score_reference = buffer.score_reference
             self._setup_model()
-            self.policy.set_statistics(buffer.observations, buffer.returns_to_go)
+            self.policy.set_statistics(*buffer.statistics())
 
     def _check_arguments(self) -> None:
         choices = {"learning_rate_schedule": LEARNING_RATE_SCHEDULES, "precision": PRECISIONS}

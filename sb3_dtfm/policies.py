@@ -152,19 +152,18 @@ class SequencePolicy(BasePolicy):
         groups = [{"params": matrices, "weight_decay": self.weight_decay}, {"params": others, "weight_decay": 0.0}]
         return self.optimizer_class(groups, lr=learning_rate, fused=True)  # type: ignore[call-arg]
 
-    def set_statistics(self, observations: th.Tensor, returns_to_go: th.Tensor) -> None:
+    def set_statistics(self, observation_mean: np.ndarray, observation_std: np.ndarray, return_scale: float) -> None:
         """
         Take the input normalisation from training data.
 
-        :param observations: (N, O)
-        :param returns_to_go: (N,), environment reward units
+        :param observation_mean: (O,)
+        :param observation_std: (O,)
+        :param return_scale: largest absolute return-to-go, environment reward units
         """
-        std, mean = th.std_mean(observations, dim=0, correction=0)
-        std = th.where(std > 1e-6, std, th.ones_like(std))  # a constant dimension becomes zero
-        scale = returns_to_go.abs().max()
-        self.observation_mean.copy_(mean)
-        self.observation_std.copy_(std)
-        self.return_scale.copy_(scale if scale > 0 else th.ones_like(scale))
+        self.observation_mean.copy_(th.from_numpy(observation_mean))
+        # A constant dimension becomes zero.
+        self.observation_std.copy_(th.from_numpy(np.where(observation_std > 1e-6, observation_std, 1.0)))
+        self.return_scale.fill_(return_scale if return_scale > 0 else 1.0)
 
     def scale_action(self, action: Any) -> Any:
         """From the environment's range to [-1, 1]; accepts tensors (..., A) and, as SB3 does, arrays."""
