@@ -9,7 +9,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_dtfm.data.episodes import EpisodeTable, Statistics, moments
-from sb3_dtfm.data.storage import STEP_ARRAYS, FileStorage, MemoryStorage
+from sb3_dtfm.data.storage import STEP_ARRAYS, FileStorage, MappedSteps, MemoryStorage
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, check_trajectory, returns_to_go
 
 # A buffer moves to an accelerator if it takes at most this share of the memory that is free there.
@@ -43,8 +43,7 @@ class TrajectoryBuffer:
     :ivar rewards: (N,) float32, environment reward units
     :ivar returns_to_go: (N,) float32, environment reward units
     :ivar episodes: the buffer's episodes, one row each
-    :ivar memory_mapped: the flat tensors are files, read where they are used
-    :ivar device: where batches are made for
+    :ivar device: what batches are made for
     """
 
     def __init__(
@@ -55,7 +54,7 @@ class TrajectoryBuffer:
         action_space: spaces.Box,
         source: str,
         score_reference: ScoreReference | None = None,
-        memory_mapped: bool = False,
+        maps: Sequence[MappedSteps] = (),
     ) -> None:
         self.observations = tensors["observations"]
         self.actions = tensors["actions"]
@@ -65,7 +64,7 @@ class TrajectoryBuffer:
         self.action_space = action_space
         self.source = source
         self.score_reference = score_reference
-        self.memory_mapped = memory_mapped
+        self._maps = maps
         self.device = self.observations.device
         self._set_episodes(episodes)
 
@@ -131,12 +130,16 @@ class TrajectoryBuffer:
             action_space,
             source,
             score_reference,
-            storage.memory_mapped,
         )
 
     def __len__(self) -> int:
         """Number of the buffer's own steps."""
         return self._n_steps
+
+    @property
+    def memory_mapped(self) -> bool:
+        """Whether the flat tensors are files that are read where they are used."""
+        return len(self._maps) > 0
 
     @property
     def n_episodes(self) -> int:
@@ -218,7 +221,7 @@ class TrajectoryBuffer:
         for name, tensor in tensors.items():
             setattr(moved, name, tensor.to(moved.device))
         moved.device = moved.observations.device
-        moved.memory_mapped = self.memory_mapped and moved.device.type == "cpu"
+        moved._maps = self._maps if moved.device.type == "cpu" else ()
         moved._set_episodes(self.episodes)
         return moved
 
@@ -238,9 +241,21 @@ class TrajectoryBuffer:
 
         :param batch_size: B
         :param generator: source of randomness, on the buffer's device
-        :return: (B,) int64
+        :return: (B,) int64 positions among the buffer's own steps
         """
         return th.randint(len(self), (batch_size,), generator=generator, device=self.device)
+
+    def prefetch(self, ends: th.Tensor, context_length: int) -> None:
+        """
+        Start to read windows from disk, if that is where they are, so that :meth:`windows` need not wait for them.
+
+        :param ends: (B,) as for :meth:`windows`
+        :param context_length: K
+        """
+        if self.memory_mapped:
+            stops = (self._locate(ends.to(self._stops.device))[0] + 1).tolist()
+            for steps in self._maps:
+                steps.will_need(stops, context_length)
 
     def windows(self, ends: th.Tensor, context_length: int) -> SequenceBatch:
         """

@@ -17,13 +17,15 @@ from gymnasium import spaces
 
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.episodes import EpisodeTable
-from sb3_dtfm.data.storage import STEP_ARRAYS, FileStorage, map_steps
+from sb3_dtfm.data.storage import STEP_ARRAYS, FileStorage, MappedSteps
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference
 
 # Counts up whenever what is stored, or what the readers make of a dataset, changes: older caches are then built anew.
 FORMAT = 1
 DESCRIPTION = "cache.json"
 EPISODES = "episodes.npz"
+# What numpy raises for a file that is missing, empty, cut off, or of another kind.
+READ_ERRORS = (OSError, EOFError, LookupError, TypeError, ValueError, zipfile.BadZipFile)
 
 
 class Fingerprint(NamedTuple):
@@ -160,28 +162,29 @@ def open_cache(folder: Path) -> TrajectoryBuffer:
             episodes = EpisodeTable(*(arrays[name] for name in EpisodeTable._fields))
             action_space = spaces.Box(arrays["action_low"], arrays["action_high"], dtype=np.float32)
             observation_space = spaces.Box(arrays["observation_low"], arrays["observation_high"], dtype=np.float32)
-    except (OSError, LookupError, ValueError, zipfile.BadZipFile) as error:
+    except READ_ERRORS as error:
         raise _damaged(folder, EPISODES, error) from error
     shapes: dict[str, tuple[int, ...]] = {"observations": observation_space.shape, "actions": action_space.shape}
     n_steps = int(description["n_steps"])
     reference = description["score_reference"]
+    maps = {name: _checked_map(folder, name, (n_steps, *shapes.get(name, ()))) for name in STEP_ARRAYS}
     return TrajectoryBuffer(
-        {name: _checked_map(folder, name, (n_steps, *shapes.get(name, ()))) for name in STEP_ARRAYS},
+        {name: steps.tensor for name, steps in maps.items()},
         episodes,
         observation_space,
         action_space,
         f"{description['source']}, cached in {folder}",
         None if reference is None else ScoreReference(*reference),
-        memory_mapped=True,
+        maps=[steps for name, steps in maps.items() if name != "rewards"],  # which windows do not hold
     )
 
 
-def _checked_map(folder: Path, name: str, shape: tuple[int, ...]) -> th.Tensor:
+def _checked_map(folder: Path, name: str, shape: tuple[int, ...]) -> MappedSteps:
     try:
-        tensor = map_steps(folder, name)
-    except (OSError, ValueError) as error:
+        steps = MappedSteps(folder, name)
+    except READ_ERRORS as error:
         raise _damaged(folder, f"{name}.npy", error) from error
-    if tensor.dtype != th.float32 or tensor.shape != shape:
-        found = f"{tensor.dtype} of shape {tuple(tensor.shape)}, expected torch.float32 of shape {shape}"
+    if steps.tensor.dtype != th.float32 or steps.tensor.shape != shape:
+        found = f"{steps.tensor.dtype} of shape {tuple(steps.tensor.shape)}, expected torch.float32 of shape {shape}"
         raise _damaged(folder, f"{name}.npy", found)
-    return tensor
+    return steps

