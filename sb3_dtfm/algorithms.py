@@ -52,7 +52,8 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
     :param context_length: K, steps the policy sees
     :param dataset_fraction: share of the episodes to learn from, randomly drawn
     :param dataset_seed: seed of that draw alone, so that different runs learn from the same episodes
-    :param dataset_kwargs: further arguments of the reader, for example `{"filter_key": "train"}` for robomimic
+    :param dataset_kwargs: further arguments of :func:`~sb3_dtfm.data.load_dataset`: `{"cache_dir": folder}` for datasets
+        larger than memory, and the reader's own, for example `{"filter_key": "train"}` for robomimic
     :param max_grad_norm: clip the gradient's norm to this; None does not clip
     :param warmup_steps: gradient steps over which the learning rate rises linearly from zero
     :param learning_rate_schedule: factor on the learning rate: "constant", or "linear" or "cosine" down to zero
@@ -136,7 +137,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
             self.max_timestep = int(buffer.episode_lengths.max())
             self.score_reference = buffer.score_reference
             self._setup_model()
-            self.policy.set_statistics(buffer.observations, buffer.returns_to_go)
+            self.policy.set_statistics(*buffer.statistics())
 
     def _check_arguments(self) -> None:
         choices = {"learning_rate_schedule": LEARNING_RATE_SCHEDULES, "precision": PRECISIONS}
@@ -286,10 +287,11 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         parallel = DataParallel(self.policy, self._loss_function(), self.batch_size)
         generator = self._training_generator(parallel)
         callback.on_training_start(locals(), globals())
+        ends = buffer.draw(self.batch_size, generator)
         while self.num_timesteps < total_timesteps:
             step_start = time.perf_counter()
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
-            self._gradient_step(buffer, generator, parallel)
+            ends = self._gradient_step(buffer, ends, generator, parallel)
             self.num_timesteps += 1
             self._training_seconds += time.perf_counter() - step_start
             if log_interval and (self.num_timesteps % log_interval == 0 or self.num_timesteps == total_timesteps):
@@ -307,11 +309,20 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         compute_loss = th.compile(self.policy.compute_loss) if compile_it else self.policy.compute_loss
         return autocast(self.precision, self.device)(compute_loss)
 
-    def _gradient_step(self, buffer: TrajectoryBuffer, generator: th.Generator, parallel: DataParallel) -> None:
+    def _gradient_step(
+        self, buffer: TrajectoryBuffer, ends: th.Tensor, generator: th.Generator, parallel: DataParallel
+    ) -> th.Tensor:
+        """
+        Learn from the windows that end at `ends`.
+
+        :return: the ends of the next batch, whose windows are read from disk meanwhile where the buffer is a cache
+        """
         self.policy.set_training_mode(True)  # an evaluation in between leaves evaluation mode on
         self._update_learning_rate(self.policy.optimizer)
-        batch = buffer.sample(self.batch_size, self.context_length, generator)
+        batch = buffer.windows(ends, self.context_length)
         loss, parts = parallel.compute_loss(batch, *self.policy.draw_noise(batch, generator))
+        next_ends = buffer.draw(self.batch_size, generator)
+        buffer.prefetch(next_ends, self.context_length)
         self.policy.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.clipped_parameters(), self.max_grad_norm or math.inf)
@@ -321,6 +332,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
             # A young average follows more closely, or the random start would stay in it for long.
             self.policy.update_ema(min(self.ema_decay, (1 + self._n_updates) / (10 + self._n_updates)))
         self._means.add(parallel.mean({"loss": loss, "grad_norm": grad_norm, **parts}))
+        return next_ends
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         remaining = self._current_progress_remaining

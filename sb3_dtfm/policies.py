@@ -181,19 +181,18 @@ class SequencePolicy(BasePolicy):
         """The parameters whose gradient norm is logged and clipped."""
         return list(self.network.parameters())
 
-    def set_statistics(self, observations: th.Tensor, returns_to_go: th.Tensor) -> None:
+    def set_statistics(self, observation_mean: np.ndarray, observation_std: np.ndarray, return_scale: float) -> None:
         """
         Take the input normalisation from training data.
 
-        :param observations: (N, O)
-        :param returns_to_go: (N,), environment reward units
+        :param observation_mean: (O,)
+        :param observation_std: (O,)
+        :param return_scale: largest absolute return-to-go, environment reward units
         """
-        std, mean = th.std_mean(observations, dim=0, correction=0)
-        std = th.where(std > 1e-6, std, th.ones_like(std))  # a constant dimension becomes zero
-        scale = returns_to_go.abs().max()
-        self.observation_mean.copy_(mean)
-        self.observation_std.copy_(std)
-        self.return_scale.copy_(scale if scale > 0 else th.ones_like(scale))
+        self.observation_mean.copy_(th.from_numpy(observation_mean))
+        # A constant dimension becomes zero.
+        self.observation_std.copy_(th.from_numpy(np.where(observation_std > 1e-6, observation_std, 1.0)))
+        self.return_scale.fill_(return_scale if return_scale > 0 else 1.0)
 
     def scale_action(self, action: Any) -> Any:
         """From the environment's range to [-1, 1]; accepts tensors (..., A) and, as SB3 does, arrays."""
@@ -287,7 +286,8 @@ class SequencePolicy(BasePolicy):
 
     def _act(self, context: Context, deterministic: bool) -> tuple[np.ndarray, np.ndarray]:
         """The newest step's actions, (B, A) in [-1, 1], and the keys and values to keep."""
-        self.set_training_mode(False)
+        if self.training:
+            self.set_training_mode(False)  # goes through all modules
         with th.inference_mode():
             *window, keys_values = (th.from_numpy(array).to(self.device) for array in context)
             windows = SequenceTensors(*window)
@@ -315,10 +315,8 @@ class SequencePolicy(BasePolicy):
             for n_missing in range(int(windows.mask.sum(dim=1).max()) - 1, 0, -1):
                 earlier = SequenceTensors(*(x.roll(n_missing, dims=1) for x in windows))
                 earlier.mask[:, :n_missing] = False  # the newest steps went round to the left
-                _, new = trunk.extend(*earlier, past=kept)
-                kept = th.cat((kept[:, :, :, 3:], new), dim=3)
-        hidden, new = trunk.extend(*windows, past=kept)
-        return hidden, th.cat((kept[:, :, :, 3:], new), dim=3)
+                _, kept = trunk.extend(*earlier, kept=kept)
+        return trunk.extend(*windows, kept=kept)
 
     def _acting_noise(self, timestep: th.Tensor, deterministic: bool) -> th.Tensor:
         """

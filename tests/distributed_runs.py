@@ -102,7 +102,7 @@ def fail_on_process_1(step: int) -> None:
     def gradient_step(*args):
         if dist.get_rank() == 1 and model.num_timesteps == step:
             raise RuntimeError("process 1 fails on purpose")
-        type(model)._gradient_step(model, *args)
+        return type(model)._gradient_step(model, *args)
 
     model._gradient_step = gradient_step
     model.learn(10**9)

@@ -19,6 +19,7 @@ from torch.nn import functional as F
 
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer
+from sb3_dtfm.data.cache import Fingerprint, load_cached
 from tests.conftest import TINY_FLOW_POLICY, TINY_POLICY, make_env, record_random_episodes
 
 ALGORITHMS = [(DT, TINY_POLICY), (DTFM, TINY_FLOW_POLICY)]
@@ -126,6 +127,19 @@ def test_both_algorithms_start_from_the_same_trunk_and_learn_from_the_same_half(
         assert th.equal(ours, theirs)
     assert dt.buffer.n_episodes == dtfm.buffer.n_episodes == 3
     assert th.equal(dt.buffer.observations, dtfm.buffer.observations)
+
+
+def test_a_cache_trains_the_same_model_as_memory(cheetah_buffer, tmp_path):
+    """Also from a random half of the episodes, and reading a batch ahead."""
+    episodes = record_random_episodes(6)
+
+    def read(storage):
+        return TrajectoryBuffer.from_trajectories(episodes, cheetah_buffer.action_space, storage=storage)
+
+    cached = load_cached(tmp_path, Fingerprint("cheetah", "", ""), "cheetah", read)
+    models = [make_model(DTFM, buffer, dataset_fraction=0.5).learn(5, log_interval=2) for buffer in (cheetah_buffer, cached)]
+    assert models[1].buffer.memory_mapped
+    assert th.equal(*map(weights, models))
 
 
 class CountSteps(BaseCallback):

@@ -13,18 +13,23 @@ from gymnasium import spaces
 from minari.dataset.minari_dataset import parse_dataset_id
 from minari.storage import get_dataset_path
 
-from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, TrajectoryBuffer
+from sb3_dtfm.data.buffer import TrajectoryBuffer
+from sb3_dtfm.data.storage import FileStorage
+from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory
 from sb3_dtfm.envs.return_to_go import flatten_observation_space, sort_observation_space
 
 HDF5_FILE_NAME = "main_data.hdf5"
+# Bytes that HDF5 may keep of a file's structure; its own limit is a third of a usual dataset's size.
+STRUCTURE_CACHE = 2**20
 EPISODE_KEYS = ("observations", "actions", "rewards", "terminations", "truncations")
 
 
-def load_minari(dataset: str | minari.MinariDataset) -> TrajectoryBuffer:
+def load_minari(dataset: str | minari.MinariDataset, storage: FileStorage | None = None) -> TrajectoryBuffer:
     """
     Read a Minari dataset: a local one, else one that Minari's own client downloads.
 
     :param dataset: id (`namespace/name-vN`) or an opened dataset, whose choice of episodes is kept
+    :param storage: where the steps go, memory if not given
     :return: its episodes, with the normalised-score scale of its metadata where it names one
     :raises DatasetError: neither found nor downloaded, damaged, or not fit for learning (names the file and episode)
     """
@@ -40,15 +45,15 @@ def load_minari(dataset: str | minari.MinariDataset) -> TrajectoryBuffer:
         observation_space = flatten_observation_space(dataset.observation_space)
     except ValueError as error:
         raise DatasetError(f"{source}: {error}") from error
-    episodes = _Hdf5Episodes(dataset, source, hdf5_file) if in_hdf5 else _StorageEpisodes(dataset, source)
     try:
         return TrajectoryBuffer.from_trajectories(
-            episodes.trajectories(),
+            _read_hdf5(dataset, source, hdf5_file) if in_hdf5 else _read_storage(dataset, source),
             action_space,
             observation_space,
-            lengths=episodes.lengths(),
+            n_steps=dataset.total_steps,
             source=source,
             score_reference=score_reference(dataset),
+            storage=storage,
         )
     except (OSError, LookupError, RuntimeError) as error:
         raise DatasetError(f"{source}: the file is damaged or incomplete: {error}") from error
@@ -108,50 +113,31 @@ def score_reference(dataset: minari.MinariDataset) -> ScoreReference | None:
     return ScoreReference(float(minimum), float(maximum), scale)
 
 
-class _Hdf5Episodes:
+def _read_hdf5(dataset: minari.MinariDataset, source: str, path: Path) -> Iterator[Trajectory]:
     """Reads the HDF5 file itself, since Minari's storage decodes all infos with every episode."""
-
-    def __init__(self, dataset: minari.MinariDataset, source: str, path: Path) -> None:
-        self.dataset = dataset
-        self.source = source
-        self.path = path
-
-    def lengths(self) -> list[int]:
-        """Steps of each episode."""
-        with h5py.File(self.path, "r") as file:
-            return [self._length(file, index) for index in self.dataset.episode_indices]
-
-    def trajectories(self) -> Iterator[Trajectory]:
-        with h5py.File(self.path, "r") as file:
-            for index in self.dataset.episode_indices:
-                episode = file[f"episode_{index}"]
-                yield make_trajectory(episode, self.dataset.observation_space, f"episode {index}", self.source)
-
-    def _length(self, file: h5py.File, index: int) -> int:
-        episode = file.get(f"episode_{index}", {})
-        keys = set(episode)
-        missing = [key for key in EPISODE_KEYS if key not in keys]
-        if missing:
-            raise DatasetError(f"{self.source}, episode {index}: holds no {', '.join(missing)}; the file is incomplete.")
-        return len(episode["rewards"])
+    with h5py.File(path, "r") as file:
+        cache = file.id.get_mdc_config()
+        cache.set_initial_size = True
+        cache.initial_size = cache.min_size = cache.max_size = STRUCTURE_CACHE
+        file.id.set_mdc_config(cache)
+        for index in dataset.episode_indices:
+            try:
+                yield make_trajectory(file[f"episode_{index}"], dataset.observation_space, f"episode {index}", source)
+            except KeyError:
+                keys = set(file.get(f"episode_{index}", ()))
+                missing = [key for key in EPISODE_KEYS if key not in keys]
+                if not missing:
+                    raise
+                raise DatasetError(
+                    f"{source}, episode {index}: holds no {', '.join(missing)}; the file is incomplete."
+                ) from None
 
 
-class _StorageEpisodes:
+def _read_storage(dataset: minari.MinariDataset, source: str) -> Iterator[Trajectory]:
     """Reads through Minari's storage: Arrow and Parquet."""
-
-    def __init__(self, dataset: minari.MinariDataset, source: str) -> None:
-        self.dataset = dataset
-        self.source = source
-
-    def lengths(self) -> list[int]:
-        """Steps of each episode."""
-        metadata = self.dataset.storage.get_episode_metadata(self.dataset.episode_indices)
-        return [int(episode["total_steps"]) for episode in metadata]
-
-    def trajectories(self) -> Iterator[Trajectory]:
-        episodes = self.dataset.storage.get_episodes(self.dataset.episode_indices)
-        for index, episode in zip(self.dataset.episode_indices, episodes, strict=True):
-            yield make_trajectory(episode, self.dataset.observation_space, f"episode {index}", self.source)
+    episodes = dataset.storage.get_episodes(dataset.episode_indices)
+    for index, episode in zip(dataset.episode_indices, episodes, strict=True):
+        yield make_trajectory(episode, dataset.observation_space, f"episode {index}", source)
 
 
 def make_trajectory(episode: Mapping[str, Any], observation_space: spaces.Space, name: str, source: str) -> Trajectory:
@@ -163,9 +149,11 @@ def make_trajectory(episode: Mapping[str, Any], observation_space: spaces.Space,
     :param name: what the file calls the episode
     :param source: the file, for messages
     :raises DatasetError: its arrays differ in length
+    :raises KeyError: one of them is missing
     """
-    n_steps = len(episode["rewards"])
-    columns = flatten_observations(episode["observations"], sort_observation_space(observation_space))
+    rewards = np.asarray(read_array(episode, "rewards"), dtype=np.float64)
+    n_steps = len(rewards)
+    columns = flatten_observations(episode, "observations", sort_observation_space(observation_space))
     counts = sorted({len(column) for column in columns})
     if len(counts) != 1 or counts[0] - n_steps not in (0, 1):
         raise DatasetError(
@@ -174,29 +162,51 @@ def make_trajectory(episode: Mapping[str, Any], observation_space: spaces.Space,
         )
     return Trajectory(
         observations=np.concatenate(columns, axis=1)[:n_steps] if len(columns) > 1 else columns[0][:n_steps],
-        actions=episode["actions"][:],
-        rewards=np.asarray(episode["rewards"][:], dtype=np.float64),
-        terminated=bool(n_steps and episode["terminations"][-1]),
-        truncated=bool(n_steps and episode["truncations"][-1]),
+        actions=read_array(episode, "actions"),
+        rewards=rewards,
+        terminated=bool(n_steps and read_array(episode, "terminations")[-1]),
+        truncated=bool(n_steps and read_array(episode, "truncations")[-1]),
         name=name,
     )
 
 
-def flatten_observations(data: Any, space: spaces.Space) -> list[np.ndarray]:
+def flatten_observations(parent: Any, key: str | int, space: spaces.Space) -> list[np.ndarray]:
     """
     A whole episode's observations as columns of the vector that the wrapper makes of one observation.
 
-    :param data: HDF5 dataset, array or list of T + 1 (or T) entries; groups, dicts and tuples of these for Dict and Tuple
+    :param parent: HDF5 group, dict or tuple that holds T + 1 (or T) entries
+    :param key: under this name, or in groups, dicts and tuples of that name for Dict and Tuple
     :param space: observation space with sorted keys
     :return: arrays (T + 1, .) to be joined along the second axis
     """
     if isinstance(space, spaces.Dict):
-        return [column for key, part in space.spaces.items() for column in flatten_observations(data[key], part)]
-    if isinstance(space, spaces.Tuple):
-        parts: Any = [data[f"_index_{i}"] for i in range(len(space))] if isinstance(data, h5py.Group) else data
-        columns = [flatten_observations(entry, part) for entry, part in zip(parts, space.spaces, strict=True)]
+        columns = [flatten_observations(parent[key], name, part) for name, part in space.spaces.items()]
         return list(itertools.chain.from_iterable(columns))
-    values = np.asarray(data[:])
+    if isinstance(space, spaces.Tuple):
+        data = parent[key]
+        names = [f"_index_{i}" if isinstance(data, h5py.Group) else i for i in range(len(space))]
+        columns = [flatten_observations(data, name, part) for name, part in zip(names, space.spaces, strict=True)]
+        return list(itertools.chain.from_iterable(columns))
+    values = read_array(parent, key)
     if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
         return [np.stack([np.asarray(spaces.flatten(space, value)) for value in values])]
     return [values.reshape(len(values), -1)]
+
+
+def read_array(parent: Any, key: str | int) -> np.ndarray:
+    """
+    All values of an array.
+
+    Most of the time that `parent[key][:]` takes goes into h5py's objects, so HDF5 is asked directly.
+
+    :param parent: HDF5 group, dict or tuple
+    :param key: what the array is called there
+    :raises KeyError: nothing is called so
+    """
+    if not isinstance(parent, h5py.Group):
+        return np.asarray(parent[key])
+    data = h5py.h5d.open(parent.id, str(key).encode())
+    values = np.empty(data.shape, data.dtype)
+    if values.size > 0:
+        data.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
+    return values

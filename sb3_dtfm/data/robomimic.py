@@ -14,7 +14,9 @@ import h5py
 import numpy as np
 from gymnasium import spaces
 
-from sb3_dtfm.data.trajectories import DatasetError, Trajectory, TrajectoryBuffer
+from sb3_dtfm.data.buffer import TrajectoryBuffer
+from sb3_dtfm.data.storage import FileStorage
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory
 
 DEFAULT_OBSERVATION_KEYS = ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos", "object")
 ALIASES = {"object": "object-state", "object-state": "object"}  # robomimic's name and robosuite's
@@ -23,7 +25,10 @@ OLD_LAYOUT_TOLERANCE = 1e-3  # metres
 
 
 def load_robomimic(
-    path: str | os.PathLike[str], filter_key: str | None = None, observation_keys: Sequence[str] | None = None
+    path: str | os.PathLike[str],
+    filter_key: str | None = None,
+    observation_keys: Sequence[str] | None = None,
+    storage: FileStorage | None = None,
 ) -> TrajectoryBuffer:
     """
     The demonstrations of a robomimic hdf5 file, of robosuite 1.4 or 1.5.
@@ -41,6 +46,7 @@ def load_robomimic(
     :param filter_key: read only the demonstrations listed in `mask/<filter_key>`, such as "train"
     :param observation_keys: which of a demonstration's `obs` make up the observation, in this order; robomimic's
         low-dimensional ones by default
+    :param storage: where the steps go, memory if not given
     :return: actions in the controller's input range, [-1, 1] if the file says nothing else
     :raises DatasetError: no such file, not readable, nothing in it, unknown keys, wrong shapes, NaN or infinity, or actions
         out of range; names the file, the demonstration and the step
@@ -48,7 +54,7 @@ def load_robomimic(
     source = str(path)
     try:
         with _open(source) as file:
-            return _read(file, source, filter_key, tuple(observation_keys or DEFAULT_OBSERVATION_KEYS))
+            return _read(file, source, filter_key, tuple(observation_keys or DEFAULT_OBSERVATION_KEYS), storage)
     except OSError as error:
         raise DatasetError(f"{source}: cannot be read to the end ({error}); is the file cut off?") from error
 
@@ -61,7 +67,9 @@ def _open(source: str) -> h5py.File:
     return h5py.File(source, "r")
 
 
-def _read(file: h5py.File, source: str, filter_key: str | None, observation_keys: tuple[str, ...]) -> TrajectoryBuffer:
+def _read(
+    file: h5py.File, source: str, filter_key: str | None, observation_keys: tuple[str, ...], storage: FileStorage | None
+) -> TrajectoryBuffer:
     data = file.get("data")
     if not isinstance(data, h5py.Group):
         raise DatasetError(f"{source}: has no group 'data', only {_listed(file)}; a robomimic hdf5 file is expected.")
@@ -93,8 +101,9 @@ def _read(file: h5py.File, source: str, filter_key: str | None, observation_keys
     return TrajectoryBuffer.from_trajectories(
         trajectories(),
         action_space=_action_space(env_args, n_actions, source),
-        lengths=[len(rewards[name]) for name in demos],
+        n_steps=sum(len(rewards[name]) for name in demos),
         source=source,
+        storage=storage,
     )
 
 

@@ -39,19 +39,19 @@ class TransformerBlock(nn.Module):
             key, value = F.linear(normed, weight[width:], bias[width:]).split(width, dim=-1)
         return self._finish(tokens[:, queries], query, key, value, attention_bias[:, :, queries])
 
-    def extend(self, tokens: th.Tensor, past: th.Tensor, attention_bias: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def extend(self, tokens: th.Tensor, keys_values: th.Tensor, attention_bias: th.Tensor) -> th.Tensor:
         """
-        Compute new tokens only, from the keys and values that earlier ones left behind.
+        Compute new tokens only, from the keys and values of all.
 
         :param tokens: (B, N, D), the new ones
-        :param past: (B, 2, P, D), keys and values of earlier tokens
-        :param attention_bias: (B, heads, N, P + N)
-        :return: (B, N, D), and keys and values of the new tokens, (B, 2, N, D)
+        :param keys_values: (B, 2, L, D); those of the last N tokens are filled in here
+        :param attention_bias: (B, heads, N, L)
+        :return: (B, N, D)
         """
         query, key, value = self.attention_in(self.attention_norm(tokens)).split(tokens.shape[-1], dim=-1)
-        new = th.stack((key, value), dim=1)
-        key, value = th.cat((past, new), dim=2).unbind(dim=1)
-        return self._finish(tokens, query, key, value, attention_bias), new
+        keys_values[:, 0, -tokens.shape[1] :] = key
+        keys_values[:, 1, -tokens.shape[1] :] = value
+        return self._finish(tokens, query, keys_values[:, 0], keys_values[:, 1], attention_bias)
 
     def _finish(
         self, tokens: th.Tensor, query: th.Tensor, key: th.Tensor, value: th.Tensor, attention_bias: th.Tensor
@@ -179,7 +179,7 @@ class SequenceTrunk(nn.Module):
         returns_to_go: th.Tensor,
         timesteps: th.Tensor,
         mask: th.Tensor,
-        past: th.Tensor,
+        kept: th.Tensor,
     ) -> tuple[th.Tensor, th.Tensor]:
         """
         The newest step's hidden state from what earlier steps left behind: three new tokens instead of a whole window.
@@ -190,8 +190,8 @@ class SequenceTrunk(nn.Module):
         band of K steps over the whole episode from then on.
 
         :param observations: (B, K, O), and the others as for :meth:`forward`; the last two steps are read
-        :param past: (B, layers, 2, 3 (K - 1), D), keys and values that the K - 1 calls before this one returned
-        :return: (B, D) hidden state, and the new tokens' keys and values (B, layers, 2, 3, D)
+        :param kept: (B, layers, 2, 3 (K - 1), D), keys and values of the K - 1 steps before; anything where `mask` is False
+        :return: (B, D) hidden state, and what to keep for the next step, shaped like `kept`
         """
         time = self._time(timesteps[:, -2:])
         new = (
@@ -203,12 +203,12 @@ class SequenceTrunk(nn.Module):
         # In triples of action before, return-to-go, observation; the action before the oldest step is out of sight.
         seen = th.stack((F.pad(mask[:, :-1], (1, 0)), mask, mask), dim=2).flatten(1)
         attention_bias = self._attention_bias(causal_mask(seen)[:, :, -3:])
-        kept = []
-        for block, block_past in zip(self.blocks, past.unbind(dim=1), strict=True):
+        keys_values = kept.new_empty(*kept.shape[:3], kept.shape[3] + 3, self.embed_dim)
+        keys_values[:, :, :, :-3] = kept
+        for block, block_keys_values in zip(self.blocks, keys_values.unbind(dim=1), strict=True):
             assert isinstance(block, TransformerBlock)
-            tokens, keys_values = block.extend(tokens, block_past, attention_bias)
-            kept.append(keys_values)
-        return self.final_norm(tokens[:, -1]), th.stack(kept, dim=1)
+            tokens = block.extend(tokens, block_keys_values, attention_bias)
+        return self.final_norm(tokens[:, -1]), keys_values[:, :, :, 3:]
 
     def _time(self, timesteps: th.Tensor) -> th.Tensor:
         return self.embed_timestep(timesteps.clamp(max=self.embed_timestep.num_embeddings - 1))

@@ -31,6 +31,9 @@ def train_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--dataset", help="dt, dtfm: Minari id or robomimic hdf5 file to learn from")
     parser.add_argument("--dataset-fraction", type=float, help="dt, dtfm: randomly drawn share of the episodes, in (0, 1]")
+    parser.add_argument(
+        "--dataset-cache", metavar="DIR", help="dt, dtfm: learn from memory-mapped files made in this folder"
+    )
     parser.add_argument("--target-return", type=float, help="dt, dtfm: return to ask for when acting, in reward units")
     parser.add_argument(
         "-conf",
@@ -90,12 +93,15 @@ def _check_task(conf_file: str, env_id: str, hyperparams: Sequence[str]) -> None
 def _shorthands(options: argparse.Namespace) -> list[tuple[str, str]]:
     """Pairs of an option that was given and its `key:value`, whose value RL-Zoo evaluates as Python."""
     wrapper = [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": options.target_return}}]
+    own_kwargs = [given.partition(":")[2] for given in options.hyperparams if given.startswith("dataset_kwargs:")]
+    cached = f"{{**({(own_kwargs or ['{}'])[-1]}), 'cache_dir': {options.dataset_cache!r}}}"
     candidates = [
-        ("--dataset", "dataset", options.dataset, options.dataset),
-        ("--dataset-fraction", "dataset_fraction", options.dataset_fraction, options.dataset_fraction),
-        ("--target-return", "env_wrapper", options.target_return, wrapper),
+        ("--dataset", "dataset", options.dataset, repr(options.dataset)),
+        ("--dataset-fraction", "dataset_fraction", options.dataset_fraction, repr(options.dataset_fraction)),
+        ("--dataset-cache", "dataset_kwargs", options.dataset_cache, cached),
+        ("--target-return", "env_wrapper", options.target_return, repr(wrapper)),
     ]
-    return [(option, f"{key}:{value!r}") for option, key, given, value in candidates if given is not None]
+    return [(option, f"{key}:{value}") for option, key, given, value in candidates if given is not None]
 
 
 def enjoy_arguments(argv: Sequence[str]) -> list[str]:

@@ -108,6 +108,7 @@ def test_a_block_gives_each_query_what_it_gives_it_among_all(trunk, window):
 
 def keep_extending(trunk, window, n_steps):
     """Hidden states of an episode's steps, each from three new tokens, with a window of K steps."""
+    trunk.requires_grad_(False)
     batch, context_length = len(window["mask"]), K
     kept = th.zeros(batch, trunk.n_layers, 2, 3 * (context_length - 1), trunk.embed_dim)
     hidden_states = []
@@ -119,8 +120,7 @@ def keep_extending(trunk, window, n_steps):
             key: th.cat((th.zeros_like(value[:, :1].expand(-1, pad, *value.shape[2:])), value), 1)
             for key, value in seen.items()
         }
-        hidden, new = trunk.extend(**padded, past=kept)
-        kept = th.cat((kept[:, :, :, 3:], new), dim=3)
+        hidden, kept = trunk.extend(**padded, kept=kept)
         hidden_states.append(hidden)
     return th.stack(hidden_states, dim=1)
 

@@ -54,6 +54,16 @@ def test_shorthands_join_the_users_hyperparameters():
     assert read.env_kwargs == {"a": 1}
 
 
+def test_a_cache_joins_the_users_own_options_of_the_reader():
+    arguments = ["--algo", "dt", *ENV, "--dataset-cache", "it's a/folder"]
+    assert zoo_reads(train_arguments(arguments)).hyperparams == {"dataset_kwargs": {"cache_dir": "it's a/folder"}}
+    arguments += ["-params", "dataset_kwargs:dict(filter_key='train')", "batch_size:8"]
+    assert zoo_reads(train_arguments(arguments)).hyperparams == {
+        "dataset_kwargs": {"filter_key": "train", "cache_dir": "it's a/folder"},
+        "batch_size": 8,
+    }
+
+
 def test_a_dataset_for_an_online_algorithm_is_refused():
     with pytest.raises(UsageError, match="--dataset: for --algo dt and dtfm only, not for sac"):
         train_arguments(["--algo", "sac", "--dataset", "x"])

@@ -1,0 +1,302 @@
+"""All recorded episodes flat in a `TrajectoryBuffer`, sampled in windows."""
+
+import copy
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+from sb3_dtfm.data.episodes import EpisodeTable, Statistics, moments
+from sb3_dtfm.data.storage import STEP_ARRAYS, FileStorage, MappedSteps, MemoryStorage
+from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, check_trajectory, returns_to_go
+
+# A buffer moves to an accelerator if it takes at most this share of the memory that is free there.
+DEVICE_MEMORY_SHARE = 0.5
+
+
+class SequenceBatch(NamedTuple):
+    """
+    Windows of K consecutive steps, padded on the left; padded entries are zero and False in `mask`.
+
+    Shapes: observations (B, K, O), actions (B, K, A) in the environment's range, returns_to_go (B, K) in environment
+    reward units, timesteps (B, K) int64 counted from the episode's start, mask (B, K) bool.
+    """
+
+    observations: th.Tensor
+    actions: th.Tensor
+    returns_to_go: th.Tensor
+    timesteps: th.Tensor
+    mask: th.Tensor
+
+
+class TrajectoryBuffer:
+    """
+    Steps of episodes in flat float32 tensors, sampled as windows that may end at any step.
+
+    Build it with :meth:`from_trajectories` or a reader (`load_minari`, `load_robomimic`). A buffer of some of the episodes
+    (:meth:`select`, :meth:`random_fraction`) shares the flat tensors with the one it comes from: `rows` are its own steps.
+
+    :ivar observations: (N, O) float32
+    :ivar actions: (N, A) float32, in the environment's range
+    :ivar rewards: (N,) float32, environment reward units
+    :ivar returns_to_go: (N,) float32, environment reward units
+    :ivar episodes: the buffer's episodes, one row each
+    :ivar device: what batches are made for
+    """
+
+    def __init__(
+        self,
+        tensors: dict[str, th.Tensor],
+        episodes: EpisodeTable,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        source: str,
+        score_reference: ScoreReference | None = None,
+        maps: Sequence[MappedSteps] = (),
+    ) -> None:
+        self.observations = tensors["observations"]
+        self.actions = tensors["actions"]
+        self.rewards = tensors["rewards"]
+        self.returns_to_go = tensors["returns_to_go"]
+        self.observation_space = observation_space
+        self.action_space = action_space
+        self.source = source
+        self.score_reference = score_reference
+        self._maps = maps
+        self.device = self.observations.device
+        self._set_episodes(episodes)
+
+    def _set_episodes(self, episodes: EpisodeTable) -> None:
+        self.episodes = episodes
+        stops = np.cumsum(episodes.lengths)
+        # Positions among the buffer's own steps at which each episode ends, and what leads from a position to its row.
+        self._stops = th.from_numpy(stops).to(self.observations.device)
+        self._firsts = th.from_numpy(stops - episodes.lengths).to(self.observations.device)
+        self._starts = th.from_numpy(episodes.starts).to(self.observations.device)
+        self._n_steps = int(stops[-1])
+
+    @classmethod
+    def from_trajectories(
+        cls,
+        trajectories: Iterable[Trajectory],
+        action_space: spaces.Box,
+        observation_space: spaces.Box | None = None,
+        n_steps: int | None = None,
+        source: str = "trajectories",
+        score_reference: ScoreReference | None = None,
+        storage: MemoryStorage | FileStorage | None = None,
+    ) -> "TrajectoryBuffer":
+        """
+        Copy episodes into flat arrays, checking every number on the way.
+
+        :param trajectories: the episodes, at least one, each of at least one step; an iterator is read once
+        :param action_space: bounded Box of shape (A,)
+        :param observation_space: Box of shape (O,); unbounded with the first episode's O if not given
+        :param n_steps: steps of all episodes, where known beforehand, so that memory for them is taken once
+        :param source: where the episodes come from, for messages
+        :param score_reference: scale of the normalised score
+        :param storage: where the steps go, memory if not given
+        :raises DatasetError: nothing to learn from, wrong shapes, NaN or infinity, or actions outside of `action_space`
+        """
+        storage = storage or MemoryStorage()
+        if n_steps is None and isinstance(trajectories, Sequence):
+            n_steps = sum(map(len, trajectories))
+        storage.reserve(n_steps or 0)
+        rows: list[tuple] = []
+        start = 0
+        for trajectory in trajectories:
+            if observation_space is None:
+                observation_space = spaces.Box(-np.inf, np.inf, np.shape(trajectory.observations)[1:], np.float32)
+            check_trajectory(trajectory, observation_space, action_space, source)
+            to_go = returns_to_go(trajectory.rewards)
+            storage.append(
+                {
+                    "observations": trajectory.observations,
+                    "actions": np.clip(trajectory.actions, action_space.low, action_space.high),
+                    "rewards": trajectory.rewards,
+                    "returns_to_go": to_go,
+                }
+            )
+            rows.append(_episode_row(trajectory, start, to_go))
+            start += len(trajectory)
+        if observation_space is None or not rows:
+            raise DatasetError(f"{source}: holds no episode; at least one is needed.")
+        return cls(
+            storage.finish(),
+            EpisodeTable(*(np.array(column) for column in zip(*rows, strict=True))),
+            observation_space,
+            action_space,
+            source,
+            score_reference,
+        )
+
+    def __len__(self) -> int:
+        """Number of the buffer's own steps."""
+        return self._n_steps
+
+    @property
+    def memory_mapped(self) -> bool:
+        """Whether the flat tensors are files that are read where they are used."""
+        return len(self._maps) > 0
+
+    @property
+    def n_episodes(self) -> int:
+        return len(self.episodes.lengths)
+
+    @property
+    def episode_lengths(self) -> np.ndarray:
+        """(E,) int64"""
+        return self.episodes.lengths
+
+    @property
+    def episode_returns(self) -> np.ndarray:
+        """(E,) float64, environment reward units"""
+        return self.episodes.returns
+
+    @property
+    def terminated(self) -> np.ndarray:
+        """(E,) bool"""
+        return self.episodes.terminated
+
+    @property
+    def truncated(self) -> np.ndarray:
+        """(E,) bool"""
+        return self.episodes.truncated
+
+    @property
+    def timesteps(self) -> th.Tensor:
+        """(len(self),) int64, the buffer's own steps counted from their episodes' starts; made anew at each call."""
+        lengths = th.from_numpy(self.episodes.lengths).to(self._firsts.device)
+        return th.arange(len(self), device=lengths.device) - self._firsts.repeat_interleave(lengths)
+
+    @property
+    def rows(self) -> th.Tensor:
+        """(len(self),) int64, where the buffer's own steps lie in the flat tensors; made anew at each call."""
+        return self._locate(th.arange(len(self), device=self._stops.device))[0]
+
+    def statistics(self) -> Statistics:
+        """What inputs are normalised by, over the buffer's own steps; reads none of them."""
+        return self.episodes.statistics()
+
+    def select(self, episodes: np.ndarray) -> "TrajectoryBuffer":
+        """
+        A buffer of some of the episodes, in the order given, on the same flat tensors.
+
+        :param episodes: (E',) episode indices
+        """
+        chosen = copy.copy(self)
+        chosen._set_episodes(self.episodes.select(episodes))
+        return chosen
+
+    def random_fraction(self, fraction: float, seed: int) -> "TrajectoryBuffer":
+        """
+        A randomly drawn share of the episodes, the same for the same seed.
+
+        :param fraction: share of the episodes in (0, 1]; at least one episode is kept
+        :param seed: seed of the draw
+        :raises ValueError: `fraction` outside of (0, 1]
+        """
+        if not 0.0 < fraction <= 1.0:
+            raise ValueError(f"dataset_fraction must lie in (0, 1], got {fraction}.")
+        if fraction == 1.0:
+            return self
+        n_kept = max(1, round(fraction * self.n_episodes))
+        return self.select(np.sort(np.random.default_rng(seed).permutation(self.n_episodes)[:n_kept]))
+
+    def to(self, device: th.device | str) -> "TrajectoryBuffer":
+        """
+        The same buffer for batches on a device.
+
+        Its tensors move there if they take at most half of the memory that is free; otherwise each batch moves.
+        """
+        moved = copy.copy(self)
+        moved.device = th.device(device)
+        tensors = {name: getattr(self, name) for name in STEP_ARRAYS}
+        if moved.device.type == "cuda":
+            free, _ = th.cuda.mem_get_info(moved.device)
+            if sum(tensor.nbytes for tensor in tensors.values()) > DEVICE_MEMORY_SHARE * free:
+                return moved
+        for name, tensor in tensors.items():
+            setattr(moved, name, tensor.to(moved.device))
+        moved.device = moved.observations.device
+        moved._maps = self._maps if moved.device.type == "cpu" else ()
+        moved._set_episodes(self.episodes)
+        return moved
+
+    def sample(self, batch_size: int, context_length: int, generator: th.Generator | None = None) -> SequenceBatch:
+        """
+        Windows that end at any step of any episode with equal probability.
+
+        :param batch_size: B
+        :param context_length: K
+        :param generator: source of randomness, on the buffer's device
+        """
+        return self.windows(self.draw(batch_size, generator), context_length)
+
+    def draw(self, batch_size: int, generator: th.Generator | None = None) -> th.Tensor:
+        """
+        The random part of :meth:`sample`: what to give to :meth:`windows`.
+
+        :param batch_size: B
+        :param generator: source of randomness, on the buffer's device
+        :return: (B,) int64 positions among the buffer's own steps
+        """
+        return th.randint(len(self), (batch_size,), generator=generator, device=self.device)
+
+    def prefetch(self, ends: th.Tensor, context_length: int) -> None:
+        """
+        Start to read windows from disk, if that is where they are, so that :meth:`windows` need not wait for them.
+
+        :param ends: (B,) as for :meth:`windows`
+        :param context_length: K
+        """
+        if self.memory_mapped:
+            stops = (self._locate(ends.to(self._stops.device))[0] + 1).tolist()
+            for steps in self._maps:
+                steps.will_need(stops, context_length)
+
+    def windows(self, ends: th.Tensor, context_length: int) -> SequenceBatch:
+        """
+        The windows of K steps that end at the given steps.
+
+        :param ends: (B,) int64 positions among the buffer's own steps, episode after episode
+        :param context_length: K
+        """
+        last_rows, last_timesteps = self._locate(ends.to(self._stops.device))
+        back = th.arange(1 - context_length, 1, device=last_rows.device)
+        timesteps = last_timesteps.unsqueeze(1) + back  # (B, K), negative before the episode's start
+        mask = timesteps >= 0
+        rows = (last_rows.unsqueeze(1) + back).clamp_(min=0).flatten()
+        shape = (len(ends), context_length, -1)
+        valid = mask.unsqueeze(-1)
+        batch = SequenceBatch(
+            observations=self.observations.index_select(0, rows).view(shape) * valid,
+            actions=self.actions.index_select(0, rows).view(shape) * valid,
+            returns_to_go=self.returns_to_go.index_select(0, rows).view(mask.shape) * mask,
+            timesteps=timesteps.clamp_(min=0),
+            mask=mask,
+        )
+        if self.device.type == rows.device.type:
+            return batch
+        return SequenceBatch(*(tensor.pin_memory().to(self.device, non_blocking=True) for tensor in batch))
+
+    def _locate(self, positions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Rows in the flat tensors, and time steps, of positions among the buffer's own steps."""
+        episodes = th.searchsorted(self._stops, positions, right=True)
+        timesteps = positions - self._firsts[episodes]
+        return self._starts[episodes] + timesteps, timesteps
+
+
+def _episode_row(trajectory: Trajectory, start: int, to_go: np.ndarray) -> tuple:
+    """A row of an `EpisodeTable`."""
+    return (
+        start,
+        len(trajectory),
+        to_go[0],  # the return: the sum of all rewards in float64
+        trajectory.terminated,
+        trajectory.truncated,
+        *moments(trajectory.observations),
+        max(to_go.max(), -to_go.min()),
+    )

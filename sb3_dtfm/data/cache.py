@@ -1,0 +1,182 @@
+"""Datasets as folders of flat float32 arrays that are memory-mapped: built once, opened at once, larger than memory."""
+
+import contextlib
+import hashlib
+import json
+import re
+import shutil
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from filelock import FileLock
+from gymnasium import spaces
+
+from sb3_dtfm.data.buffer import TrajectoryBuffer
+from sb3_dtfm.data.episodes import EpisodeTable
+from sb3_dtfm.data.storage import STEP_ARRAYS, FileStorage, MappedSteps
+from sb3_dtfm.data.trajectories import DatasetError, ScoreReference
+
+# Counts up whenever what is stored, or what the readers make of a dataset, changes: older caches are then built anew.
+FORMAT = 1
+DESCRIPTION = "cache.json"
+EPISODES = "episodes.npz"
+# What numpy raises for a file that is missing, empty, cut off, or of another kind.
+READ_ERRORS = (OSError, EOFError, LookupError, TypeError, ValueError, zipfile.BadZipFile)
+
+
+class Fingerprint(NamedTuple):
+    """
+    What a cache was made from.
+
+    :param path: the dataset's file or folder
+    :param arguments: what was read of it
+    :param state: digest of names, sizes and modification times of its files
+    """
+
+    path: str
+    arguments: str
+    state: str
+
+    @classmethod
+    def of(cls, path: Path, arguments: Any) -> "Fingerprint":
+        """
+        That of a dataset as it is now.
+
+        :param path: its file, or the folder that holds its files
+        :param arguments: of the reader, as JSON can hold them
+        """
+        path = path.resolve()
+        files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+        state = [(str(file.relative_to(path)), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+        return cls(str(path), json.dumps(arguments, sort_keys=True), _digest(state))
+
+    def folder_name(self, source: str) -> str:
+        """One for each dataset and choice from it, so that a changed dataset takes the place of the old one."""
+        name = re.sub(r"[^\w.-]+", "-", source)
+        return f"{name}-{_digest([self.path, self.arguments])[:16]}"
+
+
+def _digest(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value).encode()).hexdigest()
+
+
+def load_cached(
+    cache_dir: Path, fingerprint: Fingerprint, source: str, read: Callable[[FileStorage], TrajectoryBuffer]
+) -> TrajectoryBuffer:
+    """
+    Open a dataset's cache, which is built first if there is none or the dataset has changed since.
+
+    Other processes wait while one builds. A build that does not come to its end leaves no cache.
+
+    :param cache_dir: folder of caches, made if necessary
+    :param fingerprint: of the dataset as it is now
+    :param source: name of the dataset, for the progress bar
+    :param read: fills the storage that it is given
+    :raises DatasetError: the dataset cannot be read, or the cache cannot be written or is damaged
+    """
+    folder = cache_dir / fingerprint.folder_name(source)
+    try:
+        cache_dir.mkdir(parents=True, exist_ok=True)
+        with FileLock(cache_dir / f".{folder.name}.lock"):
+            if not _is_current(folder, fingerprint):
+                _build(folder, fingerprint, source, read)
+    except OSError as error:
+        raise DatasetError(f"cache {folder} of {source} cannot be written: {error}") from error
+    return open_cache(folder)
+
+
+def _is_current(folder: Path, fingerprint: Fingerprint) -> bool:
+    if not folder.exists():
+        return False
+    description = _read_description(folder)
+    return description.get("format") == FORMAT and description.get("fingerprint") == fingerprint._asdict()
+
+
+def _build(folder: Path, fingerprint: Fingerprint, source: str, read: Callable[[FileStorage], TrajectoryBuffer]) -> None:
+    part = folder.with_name(f".{folder.name}.part")
+    for old in (part, folder):  # what a killed build left, and an outdated cache, whose room may be needed
+        if old.exists():
+            shutil.rmtree(old)
+    part.mkdir()
+    try:
+        with contextlib.closing(FileStorage(part, f"Caching {source}")) as storage:
+            buffer = read(storage)
+        _write_episodes(part, buffer)
+        description = {
+            "format": FORMAT,
+            "fingerprint": fingerprint._asdict(),
+            "source": buffer.source,
+            "score_reference": buffer.score_reference,
+            "n_steps": len(buffer),
+        }
+        (part / DESCRIPTION).write_text(json.dumps(description, indent=2))
+        part.rename(folder)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+
+
+def _write_episodes(folder: Path, buffer: TrajectoryBuffer) -> None:
+    """The arrays that are small: one row per episode, and the bounds of the spaces."""
+    boxes = {"observation": buffer.observation_space, "action": buffer.action_space}
+    bounds = {f"{name}_{bound}": getattr(box, bound) for name, box in boxes.items() for bound in ("low", "high")}
+    np.savez(folder / EPISODES, **buffer.episodes._asdict(), **bounds)
+
+
+def _read_description(folder: Path) -> dict[str, Any]:
+    try:
+        description = json.loads((folder / DESCRIPTION).read_text())
+    except (OSError, ValueError) as error:
+        raise _damaged(folder, DESCRIPTION, error) from error
+    if not isinstance(description, dict):
+        raise _damaged(folder, DESCRIPTION, "no JSON object")
+    return description
+
+
+def _damaged(folder: Path, file: str, problem: object) -> DatasetError:
+    return DatasetError(f"cache {folder}: {file} is damaged ({problem}); delete this folder to have it built anew.")
+
+
+def open_cache(folder: Path) -> TrajectoryBuffer:
+    """
+    A buffer whose steps are memory-mapped.
+
+    :param folder: of one cache
+    :raises DatasetError: the cache is damaged or incomplete
+    """
+    description = _read_description(folder)
+    try:
+        with np.load(folder / EPISODES) as arrays:
+            episodes = EpisodeTable(*(arrays[name] for name in EpisodeTable._fields))
+            action_space = spaces.Box(arrays["action_low"], arrays["action_high"], dtype=np.float32)
+            observation_space = spaces.Box(arrays["observation_low"], arrays["observation_high"], dtype=np.float32)
+    except READ_ERRORS as error:
+        raise _damaged(folder, EPISODES, error) from error
+    shapes: dict[str, tuple[int, ...]] = {"observations": observation_space.shape, "actions": action_space.shape}
+    n_steps = int(description["n_steps"])
+    reference = description["score_reference"]
+    maps = {name: _checked_map(folder, name, (n_steps, *shapes.get(name, ()))) for name in STEP_ARRAYS}
+    return TrajectoryBuffer(
+        {name: steps.tensor for name, steps in maps.items()},
+        episodes,
+        observation_space,
+        action_space,
+        f"{description['source']}, cached in {folder}",
+        None if reference is None else ScoreReference(*reference),
+        maps=[steps for name, steps in maps.items() if name != "rewards"],  # which windows do not hold
+    )
+
+
+def _checked_map(folder: Path, name: str, shape: tuple[int, ...]) -> MappedSteps:
+    try:
+        steps = MappedSteps(folder, name)
+    except READ_ERRORS as error:
+        raise _damaged(folder, f"{name}.npy", error) from error
+    if steps.tensor.dtype != th.float32 or steps.tensor.shape != shape:
+        found = f"{steps.tensor.dtype} of shape {tuple(steps.tensor.shape)}, expected torch.float32 of shape {shape}"
+        raise _damaged(folder, f"{name}.npy", found)
+    return steps

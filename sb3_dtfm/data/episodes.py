@@ -1,0 +1,97 @@
+"""What a buffer keeps of each episode besides its steps, and the statistics of any choice of episodes."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+# Rows are summed in blocks of about this many bytes, which stay in the processor's cache.
+BLOCK_BYTES = 2**18
+# A variance below this share of the mean square is computed again, without the mean.
+CANCELLATION = 1e-5
+
+
+class Statistics(NamedTuple):
+    """
+    What inputs are normalised by.
+
+    Shapes: observation_mean (O,) and observation_std (O,) over all steps, float64; return_scale, the largest absolute
+    return-to-go in environment reward units.
+    """
+
+    observation_mean: np.ndarray
+    observation_std: np.ndarray
+    return_scale: float
+
+
+class EpisodeTable(NamedTuple):
+    """
+    One row per episode.
+
+    Shapes: starts (E,) int64, the episodes' first rows in the flat step arrays; lengths (E,) int64 steps; returns (E,)
+    float64, environment reward units; terminated (E,) and truncated (E,) bool; observation_means (E, O) float64;
+    observation_squares (E, O) float64, sums of squared deviations from these means; return_scales (E,) float64, largest
+    absolute returns-to-go.
+    """
+
+    starts: np.ndarray
+    lengths: np.ndarray
+    returns: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    observation_means: np.ndarray
+    observation_squares: np.ndarray
+    return_scales: np.ndarray
+
+    def select(self, episodes: np.ndarray) -> "EpisodeTable":
+        """
+        The rows of some of the episodes, in the order given.
+
+        :param episodes: (E',) episode indices
+        """
+        return EpisodeTable(*(column[episodes] for column in self))
+
+    def statistics(self) -> Statistics:
+        """Those of all steps of all episodes of the table, without a look at the steps (Chan et al., 1979)."""
+        n_steps = self.lengths.sum()
+        mean = self.lengths @ self.observation_means / n_steps
+        squares = self.observation_squares.sum(axis=0) + self.lengths @ np.square(self.observation_means - mean)
+        return Statistics(mean, np.sqrt(squares / n_steps), float(self.return_scales.max()))
+
+
+def moments(observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Mean, and sum of squared deviations from it, of each dimension.
+
+    :param observations: (T, O)
+    :return: (O,) and (O,) float64
+    """
+    sums, squares = _power_sums(observations)
+    mean = sums / len(observations)
+    deviations = squares - mean * sums
+    # A spread that is small beside the mean drowns in the rounding of this difference, and a constant dimension would seem
+    # to have one: sums from the first row on tell.
+    close = np.flatnonzero(deviations < CANCELLATION * squares)
+    if len(close):
+        first = observations[0, close].astype(np.float64)
+        sums, squares = _power_sums(observations[:, close] - first)
+        offset = sums / len(observations)
+        mean[close] = first + offset
+        deviations[close] = np.maximum(squares - offset * sums, 0.0)
+    return mean, deviations
+
+
+def _power_sums(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Sums of the values and of their squares over the first axis, as products: numpy's own sums take several times as long.
+
+    :param values: (T, O)
+    :return: (O,) and (O,) float64
+    """
+    sums, squares = np.zeros(values.shape[1]), np.zeros(values.shape[1])
+    n_rows = max(1, BLOCK_BYTES // (8 * max(1, values.shape[1])))
+    for start in range(0, len(values), n_rows):
+        block = values[start : start + n_rows].astype(np.float64, copy=False)
+        weights = np.ones(len(block))
+        sums += weights @ block
+        squares += weights @ np.square(block)
+    return sums, squares

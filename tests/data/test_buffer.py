@@ -1,0 +1,198 @@
+"""The buffer: windows, sampling, and choices of episodes that share its arrays."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_dtfm.data import DatasetError, Trajectory, TrajectoryBuffer
+from sb3_dtfm.data.storage import STEP_ARRAYS
+from tests.data.small import ACTION_SPACE, OBSERVATION_SPACE, make_buffer, make_trajectory
+
+
+def test_return_to_go_restarts_with_each_episode():
+    trajectories = [make_trajectory(2, rewards=np.array([1.0, 2.0])), make_trajectory(3, rewards=np.array([0.0, 0.0, 1.0]))]
+    buffer = TrajectoryBuffer.from_trajectories(trajectories, ACTION_SPACE)
+    assert buffer.returns_to_go.tolist() == [3.0, 2.0, 1.0, 1.0, 1.0]
+    assert buffer.timesteps.tolist() == [0, 1, 0, 1, 2]
+    assert buffer.episode_returns.tolist() == [3.0, 1.0]
+
+
+def naive_window(trajectory: Trajectory, end: int, context_length: int) -> dict[str, np.ndarray]:
+    """What a window must hold, step by step."""
+    window = {
+        "observations": np.zeros((context_length, 3), np.float32),
+        "actions": np.zeros((context_length, 2), np.float32),
+        "returns_to_go": np.zeros(context_length, np.float32),
+        "timesteps": np.zeros(context_length, np.int64),
+        "mask": np.zeros(context_length, bool),
+    }
+    for slot in range(context_length):
+        step = end - (context_length - 1 - slot)
+        if step < 0:
+            continue
+        window["observations"][slot] = trajectory.observations[step]
+        window["actions"][slot] = trajectory.actions[step]
+        window["returns_to_go"][slot] = trajectory.rewards[step:].sum()
+        window["timesteps"][slot] = step
+        window["mask"][slot] = True
+    return window
+
+
+@pytest.mark.parametrize("context_length", [1, 3, 7, 20])
+def test_windows_equal_a_naive_reference_with_padding_at_the_start(context_length: int):
+    lengths = [5, 1, 12, 2]
+    buffer = make_buffer(lengths)
+    batch = buffer.windows(th.arange(len(buffer)), context_length)
+    assert batch.observations.shape == (sum(lengths), context_length, 3)
+    row = 0
+    for episode, length in enumerate(lengths):
+        trajectory = make_trajectory(length, episode)
+        for end in range(length):
+            for name, expected in naive_window(trajectory, end, context_length).items():
+                np.testing.assert_allclose(getattr(batch, name)[row].numpy(), expected, rtol=1e-5, atol=1e-6, err_msg=name)
+            row += 1
+
+
+def test_windows_end_at_every_step_with_equal_probability():
+    buffer = make_buffer([1, 3, 30, 66])
+    buffer.observations[:, 0] = th.arange(len(buffer))
+    n_draws = 100_000
+    batch = buffer.sample(n_draws, 4, th.Generator().manual_seed(7))
+    counts = np.bincount(batch.observations[:, -1, 0].long().numpy(), minlength=len(buffer))
+    expected = n_draws / len(buffer)
+    chi_square, freedom = np.sum((counts - expected) ** 2) / expected, len(buffer) - 1
+    assert abs(chi_square - freedom) < 4 * np.sqrt(2 * freedom)
+    assert batch.mask[:, -1].all()
+
+
+def test_sampling_repeats_with_the_same_seed():
+    buffer = make_buffer([10, 10])
+    first, second = (buffer.sample(32, 5, th.Generator().manual_seed(3)) for _ in range(2))
+    assert all(th.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+def test_episodes_shorter_than_the_context_are_padded_and_kept():
+    buffer = make_buffer([2, 1])
+    batch = buffer.windows(th.tensor([1, 2]), 5)
+    assert batch.mask.tolist() == [[False] * 3 + [True] * 2, [False] * 4 + [True]]
+    assert batch.observations[0, :3].abs().sum() == 0
+    assert batch.returns_to_go[1, :4].abs().sum() == 0
+
+
+def test_an_unfinished_last_episode_is_kept():
+    trajectories = [make_trajectory(4, terminated=True), make_trajectory(3, truncated=True), make_trajectory(2)]
+    buffer = TrajectoryBuffer.from_trajectories(trajectories, ACTION_SPACE)
+    assert buffer.n_episodes == 3
+    assert buffer.terminated.tolist() == [True, False, False]
+    assert buffer.truncated.tolist() == [False, True, False]
+    assert len(buffer) == 9
+
+
+def test_arrays_are_float32_whatever_was_recorded():
+    buffer = make_buffer([4])
+    for name in ("observations", "actions", "rewards", "returns_to_go"):
+        assert getattr(buffer, name).dtype == th.float32, name
+
+
+def test_no_episode_is_refused():
+    with pytest.raises(DatasetError, match=r"file.hdf5: holds no episode"):
+        TrajectoryBuffer.from_trajectories([], ACTION_SPACE, source="file.hdf5")
+
+
+def test_rounding_errors_beyond_the_action_bounds_are_clipped():
+    actions = make_trajectory(6).actions
+    actions[0, 0] = 1.00005
+    buffer = TrajectoryBuffer.from_trajectories([make_trajectory(6, actions=actions)], ACTION_SPACE)
+    assert buffer.actions[0, 0] == 1.0
+
+
+def test_random_fraction_is_the_same_for_the_same_seed():
+    buffer = make_buffer(list(range(1, 41)))
+    halves = [buffer.random_fraction(0.5, seed).episode_lengths.tolist() for seed in (1, 1, 2)]
+    assert halves[0] == halves[1] != halves[2]
+    assert len(set(halves[0])) == 20
+    assert buffer.random_fraction(1.0, 0) is buffer
+    assert buffer.random_fraction(0.001, 0).n_episodes == 1
+
+
+@pytest.mark.parametrize("fraction", [0.0, -0.5, 1.5, float("nan")])
+def test_random_fraction_outside_of_its_range_is_refused(fraction: float):
+    with pytest.raises(ValueError, match="dataset_fraction"):
+        make_buffer([3]).random_fraction(fraction, 0)
+
+
+@pytest.mark.parametrize("n_steps", [None, 1, 5, 100])
+def test_an_iterator_is_read_once_whatever_number_of_steps_is_announced(n_steps: int | None):
+    lengths = [3, 2, 9]
+    iterator = (make_trajectory(length, seed) for seed, length in enumerate(lengths))
+    buffer = TrajectoryBuffer.from_trajectories(iterator, ACTION_SPACE, OBSERVATION_SPACE, n_steps=n_steps)
+    expected = make_buffer(lengths)
+    for name in STEP_ARRAYS:
+        assert th.equal(getattr(buffer, name), getattr(expected, name)), name
+    assert buffer.episode_lengths.tolist() == lengths
+
+
+def test_select_takes_whole_episodes_in_the_order_given():
+    buffer = make_buffer([5, 1, 4])
+    chosen = buffer.select(np.array([2, 0]))
+    assert chosen.episode_lengths.tolist() == [4, 5]
+    assert len(chosen) == 9
+    assert chosen.rows.tolist() == [6, 7, 8, 9, 0, 1, 2, 3, 4]
+    np.testing.assert_array_equal(chosen.episode_returns, buffer.episode_returns[[2, 0]])
+    assert chosen.timesteps.tolist() == [0, 1, 2, 3, 0, 1, 2, 3, 4]
+
+
+def test_select_shares_the_arrays_and_can_be_repeated():
+    buffer = make_buffer([5, 1, 4, 2])
+    chosen = buffer.select(np.array([3, 0, 2])).select(np.array([2, 0]))
+    assert chosen.rows.tolist() == [6, 7, 8, 9, 10, 11]
+    for name in STEP_ARRAYS:
+        assert getattr(chosen, name).data_ptr() == getattr(buffer, name).data_ptr(), name
+    assert len(buffer) == 12
+
+
+def test_windows_of_a_selection_are_those_of_a_buffer_of_these_episodes_alone():
+    chosen = make_buffer([5, 1, 7, 4]).select(np.array([3, 1, 2]))
+    alone = TrajectoryBuffer.from_trajectories(
+        [make_trajectory(4, 3), make_trajectory(1, 1), make_trajectory(7, 2)], ACTION_SPACE, OBSERVATION_SPACE
+    )
+    for ours, theirs in zip(chosen.windows(th.arange(12), 6), alone.windows(th.arange(12), 6), strict=True):
+        assert th.equal(ours, theirs)
+    drawn = [buffer.sample(64, 6, th.Generator().manual_seed(2)) for buffer in (chosen, alone)]
+    assert all(th.equal(ours, theirs) for ours, theirs in zip(*drawn, strict=True))
+
+
+def test_sampling_a_selection_covers_exactly_its_steps():
+    buffer = make_buffer([5, 1, 7, 4])
+    buffer.observations[:, 0] = th.arange(len(buffer))
+    chosen = buffer.select(np.array([2, 1]))
+    batch = chosen.sample(2000, 3, th.Generator().manual_seed(0))
+    assert set(batch.observations[:, -1, 0].tolist()) == set(chosen.rows.tolist()) == set(range(5, 13))
+    assert batch.timesteps.max() == 6
+
+
+def test_the_draw_of_a_full_buffer_is_one_randint_over_its_steps():
+    """Runs of earlier versions repeat: position and row are the same there."""
+    buffer = make_buffer([5, 1, 7, 4])
+    ends = buffer.draw(32, th.Generator().manual_seed(3))
+    assert th.equal(ends, th.randint(17, (32,), generator=th.Generator().manual_seed(3)))
+    assert th.equal(buffer.windows(ends, 1).observations[:, 0], buffer.observations[ends])
+
+
+@pytest.mark.parametrize("episodes", [*itertools.permutations(range(3), 2), (0, 1, 2)])
+def test_statistics_are_those_of_the_contained_steps(episodes: tuple[int, ...]):
+    chosen = make_buffer([5, 1, 40]).select(np.array(episodes))
+    observations, to_go = chosen.observations[chosen.rows].double(), chosen.returns_to_go[chosen.rows]
+    statistics = chosen.statistics()
+    np.testing.assert_allclose(statistics.observation_mean, observations.mean(0), rtol=1e-6)
+    np.testing.assert_allclose(statistics.observation_std, observations.std(0, correction=0), rtol=1e-6)
+    assert np.float32(statistics.return_scale) == to_go.abs().max().item()
+
+
+def test_a_buffer_on_its_own_device_stays_as_it_is():
+    buffer = make_buffer([3, 2])
+    moved = buffer.to("cpu")
+    assert moved.observations.data_ptr() == buffer.observations.data_ptr()
+    assert moved.device == th.device("cpu")

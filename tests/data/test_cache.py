@@ -1,0 +1,233 @@
+"""Memory-mapped caches: the same data as from memory, made anew when the dataset changes, refused when damaged."""
+
+import json
+import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import minari
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from minari.data_collector import EpisodeBuffer
+
+from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer, load_dataset
+from sb3_dtfm.data.cache import Fingerprint, load_cached
+from sb3_dtfm.data.storage import STEP_ARRAYS, FileStorage
+from tests.data.small import ACTION_SPACE, OBSERVATION_SPACE, make_buffer, make_trajectory
+
+
+@pytest.fixture(autouse=True)
+def datasets_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+
+
+@pytest.fixture
+def robomimic_file(tmp_path: Path) -> Path:
+    path = tmp_path / "lift.hdf5"
+    rng = np.random.default_rng(0)
+    with h5py.File(path, "w") as file:
+        file.create_group("data").attrs["env_args"] = json.dumps({"env_name": "Lift"})
+        for number in range(4):
+            demo = file.create_group(f"data/demo_{number}")
+            demo["actions"] = rng.uniform(-1.0, 1.0, (9, 7))
+            demo["rewards"] = demo["dones"] = np.arange(9) == 8
+            demo["obs/object"] = rng.normal(size=(9, 10))
+        file["mask/train"] = np.array([b"demo_1", b"demo_3"])
+    return path
+
+
+def load(path: Path, cache: Path | None, **kwargs: object) -> TrajectoryBuffer:
+    return load_dataset(path, cache_dir=cache, observation_keys=["object"], **kwargs)
+
+
+def folders(cache: Path) -> list[str]:
+    """Everything in a folder of caches except its lock files."""
+    return sorted(path.name for path in cache.iterdir() if path.suffix != ".lock")
+
+
+def only_folder(cache: Path) -> Path:
+    [name] = folders(cache)
+    return cache / name
+
+
+def assert_same(ours: TrajectoryBuffer, theirs: TrajectoryBuffer) -> None:
+    for name in STEP_ARRAYS:
+        assert th.equal(getattr(ours, name), getattr(theirs, name)), name
+    for name, column in theirs.episodes._asdict().items():
+        np.testing.assert_array_equal(getattr(ours.episodes, name), column, err_msg=name)
+        assert getattr(ours.episodes, name).dtype == column.dtype, name
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    assert ours.score_reference == theirs.score_reference
+
+
+def forbid_reading(monkeypatch: pytest.MonkeyPatch) -> None:
+    def append(self: FileStorage, steps: object) -> None:
+        raise AssertionError("the dataset is read again")
+
+    monkeypatch.setattr(FileStorage, "append", append)
+
+
+def test_a_cache_holds_what_the_file_holds_and_is_opened_without_reading_it(
+    robomimic_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    from_memory = load(robomimic_file, None)
+    built = load(robomimic_file, tmp_path / "cache")
+    forbid_reading(monkeypatch)
+    opened = load(robomimic_file, tmp_path / "cache")
+    for buffer in (built, opened):
+        assert_same(buffer, from_memory)
+        assert buffer.memory_mapped
+        assert str(robomimic_file) in buffer.source
+        assert str(only_folder(tmp_path / "cache")) in buffer.source
+    assert not from_memory.memory_mapped
+
+
+def test_a_minari_dataset_is_cached_with_its_score_scale_and_choice_of_episodes(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    episodes = [
+        EpisodeBuffer(
+            observations=rng.normal(size=(n + 1, 3)),
+            actions=rng.uniform(-1, 1, (n, 1)),
+            rewards=rng.normal(size=n),
+            terminations=np.zeros(n, bool),
+            truncations=np.arange(n) == n - 1,
+        )
+        for n in (4, 7, 5)
+    ]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        dataset = minari.create_dataset_from_buffers(
+            "test/set-v0", episodes, env="Pendulum-v1", ref_min_score=-10.0, ref_max_score=30.0,
+            action_space=spaces.Box(-1.0, 1.0, (1,), np.float32),
+        )  # fmt: skip
+    cached = load_dataset("test/set-v0", cache_dir=tmp_path / "cache")
+    assert isinstance(cached.score_reference, ScoreReference)
+    assert_same(cached, load_dataset("test/set-v0"))
+    chosen = dataset.filter_episodes(lambda episode: len(episode.rewards) > 4)
+    assert load_dataset(chosen, cache_dir=tmp_path / "cache").episode_lengths.tolist() == [7, 5]
+    assert load_dataset(dataset, cache_dir=tmp_path / "cache").episode_lengths.tolist() == [4, 7, 5]
+    assert len(folders(tmp_path / "cache")) == 2
+
+
+def test_windows_fractions_and_statistics_of_a_cache_are_those_from_memory(robomimic_file: Path, tmp_path: Path):
+    buffers = [load(robomimic_file, cache).random_fraction(0.5, 1) for cache in (None, tmp_path / "cache")]
+    ends = [buffer.draw(20, th.Generator().manual_seed(0)) for buffer in buffers]
+    assert th.equal(*ends)
+    buffers[1].prefetch(ends[1], 5)
+    windows = [buffer.windows(ends[0], 5) for buffer in buffers]
+    assert all(th.equal(ours, theirs) for ours, theirs in zip(*windows, strict=True))
+    for ours, theirs in zip(*(buffer.statistics() for buffer in buffers), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_every_window_can_be_prefetched(robomimic_file: Path, tmp_path: Path):
+    """The first window starts before the file does, and the last one stops where it ends."""
+    buffer = load(robomimic_file, tmp_path / "cache")
+    buffer.prefetch(th.arange(len(buffer)), 20)
+
+
+def test_what_is_written_to_a_buffer_does_not_reach_the_cache(robomimic_file: Path, tmp_path: Path):
+    load(robomimic_file, tmp_path / "cache").observations.fill_(7.0)
+    assert load(robomimic_file, tmp_path / "cache").observations.max() < 7.0
+
+
+def test_other_arguments_have_a_cache_of_their_own(robomimic_file: Path, tmp_path: Path):
+    assert load(robomimic_file, tmp_path / "cache").n_episodes == 4
+    assert load(robomimic_file, tmp_path / "cache", filter_key="train").n_episodes == 2
+    assert len(folders(tmp_path / "cache")) == 2
+
+
+def test_a_changed_file_replaces_its_cache(robomimic_file: Path, tmp_path: Path):
+    load(robomimic_file, tmp_path / "cache")
+    before = folders(tmp_path / "cache")
+    with h5py.File(robomimic_file, "a") as file:
+        file["data/demo_2/actions"][3] = 0.25
+    os.utime(robomimic_file, ns=(0, 12345))
+    buffer = load(robomimic_file, tmp_path / "cache")
+    assert buffer.actions[21].tolist() == [0.25] * 7
+    assert folders(tmp_path / "cache") == before
+
+
+def test_a_cache_of_an_older_format_is_made_anew(robomimic_file: Path, tmp_path: Path):
+    load(robomimic_file, tmp_path / "cache")
+    description = only_folder(tmp_path / "cache") / "cache.json"
+    description.write_text(description.read_text().replace('"format": 1', '"format": 0'))
+    load(robomimic_file, tmp_path / "cache")
+    assert json.loads(description.read_text())["format"] == 1
+
+
+def test_a_dataset_that_is_refused_leaves_no_cache(robomimic_file: Path, tmp_path: Path):
+    with h5py.File(robomimic_file, "a") as file:
+        file["data/demo_2/actions"][3] = np.nan
+    with pytest.raises(DatasetError, match=r"lift.hdf5, demo_2, step 3: actions hold nan"):
+        load(robomimic_file, tmp_path / "cache")
+    assert folders(tmp_path / "cache") == []
+
+
+def test_a_killed_build_leaves_no_cache_and_nothing_that_disturbs_the_next_one(tmp_path: Path):
+    script = f"""
+import os, pathlib
+from sb3_dtfm.data import TrajectoryBuffer
+from sb3_dtfm.data.cache import Fingerprint, load_cached
+from tests.data.small import ACTION_SPACE, make_trajectory
+def episodes():
+    yield make_trajectory(5)
+    os.kill(os.getpid(), 9)
+load_cached(pathlib.Path(r"{tmp_path}"), Fingerprint("set", "", ""), "set",
+    lambda storage: TrajectoryBuffer.from_trajectories(episodes(), ACTION_SPACE, storage=storage))
+"""
+    root = Path(__file__).parents[2]
+    environment = {**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
+    assert subprocess.run([sys.executable, "-c", script], env=environment, cwd=root, check=False).returncode == -9
+    [left] = folders(tmp_path)
+    assert left.endswith(".part")
+    buffer = load_cached(tmp_path, Fingerprint("set", "", ""), "set", fill([5, 3]))
+    assert_same(buffer, make_buffer([5, 3]))
+    assert not only_folder(tmp_path).name.endswith(".part")
+
+
+def fill(lengths: list[int]) -> Callable[[FileStorage], TrajectoryBuffer]:
+    trajectories = [make_trajectory(length, seed) for seed, length in enumerate(lengths)]
+    return lambda storage: TrajectoryBuffer.from_trajectories(trajectories, ACTION_SPACE, OBSERVATION_SPACE, storage=storage)
+
+
+@pytest.mark.parametrize("name", ["observations.npy", "returns_to_go.npy", "episodes.npz", "cache.json"])
+@pytest.mark.parametrize("damage", ["missing", "empty", "cut off", "other"])
+def test_a_damaged_cache_is_refused_with_what_to_do(name: str, damage: str, robomimic_file: Path, tmp_path: Path):
+    load(robomimic_file, tmp_path / "cache")
+    file = only_folder(tmp_path / "cache") / name
+    content = file.read_bytes()
+    if damage == "missing":
+        file.unlink()
+    elif damage == "other":
+        np.save(file.with_suffix(".npy"), np.zeros(3))
+        os.replace(file.with_suffix(".npy"), file)
+    else:
+        file.write_bytes(content[: len(content) - 4 if damage == "cut off" else 0])
+    with pytest.raises(DatasetError, match=rf"{name} is damaged .*; delete this folder to have it built anew"):
+        load(robomimic_file, tmp_path / "cache")
+
+
+def test_a_cache_that_cannot_be_written_is_named(robomimic_file: Path, tmp_path: Path):
+    (tmp_path / "cache").write_text("a file")
+    with pytest.raises(DatasetError, match=r"cache .*lift.hdf5.* cannot be written"):
+        load(robomimic_file, tmp_path / "cache")
+
+
+def test_a_full_disk_is_no_fault_of_the_dataset(tmp_path: Path):
+    (tmp_path / "observations.npy").symlink_to("/dev/full")
+    storage = FileStorage(tmp_path, "test")
+    with pytest.raises(DatasetError, match=r"cannot be written: .*No space left"):
+        storage.append({"observations": np.zeros((2**19, 1))})
+
+
+def test_a_buffer_has_no_cache(tmp_path: Path):
+    with pytest.raises(TypeError, match="unknown option cache_dir; accepted: none"):
+        load_dataset(make_buffer([2]), cache_dir=tmp_path)
