@@ -14,6 +14,7 @@ from torch import nn
 from sb3_dtfm.context import Context, empty_context, push, unpack_observation, with_action
 from sb3_dtfm.networks.flow import ONE_STEP, check_solver
 from sb3_dtfm.networks.heads import FlowHead, RegressionHead
+from sb3_dtfm.networks.linear import threads_for
 from sb3_dtfm.networks.trunk import SequenceTrunk
 
 # Observations are clipped at this many standard deviations, as SB3's VecNormalize does.
@@ -297,7 +298,8 @@ class SequencePolicy(BasePolicy):
                 hidden = self.hidden_states(self.acting_network, windows, last_only=True).squeeze(1)
                 keys_values = keys_values.new_zeros(len(hidden), 0)
             noise = self._acting_noise(windows.timesteps[:, -1], deterministic)
-            actions = self._generate(hidden, noise).clamp(-1.0, 1.0)
+            with threads_for(len(hidden)):
+                actions = self._generate(hidden, noise).clamp(-1.0, 1.0)
             return actions.cpu().numpy(), keys_values.cpu().numpy()
 
     def _extend(self, windows: SequenceTensors, kept: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -316,7 +318,8 @@ class SequencePolicy(BasePolicy):
                 earlier = SequenceTensors(*(x.roll(n_missing, dims=1) for x in windows))
                 earlier.mask[:, :n_missing] = False  # the newest steps went round to the left
                 _, kept = trunk.extend(*earlier, kept=kept)
-        return trunk.extend(*windows, kept=kept)
+        with threads_for(3 * len(kept)):
+            return trunk.extend(*windows, kept=kept)
 
     def _acting_noise(self, timestep: th.Tensor, deterministic: bool) -> th.Tensor:
         """

@@ -11,6 +11,8 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_dtfm.networks.linear import Linear
+
 Field = Callable[[th.Tensor, float], th.Tensor]
 SolverStep = Callable[[Field, th.Tensor, float, float], th.Tensor]
 
@@ -62,9 +64,9 @@ class FilmNetwork(nn.Module):
         self.n_layers = n_layers
         self.film_dim = 2 * hidden_dim * n_layers
         sizes = [action_dim] + [hidden_dim] * n_layers
-        self.layers = nn.ModuleList(nn.Linear(sizes[i], sizes[i + 1]) for i in range(n_layers))
-        self.film_condition = nn.Linear(condition_dim, self.film_dim)
-        self.output = nn.Linear(hidden_dim, action_dim)
+        self.layers = nn.ModuleList(Linear(sizes[i], sizes[i + 1]) for i in range(n_layers))
+        self.film_condition = Linear(condition_dim, self.film_dim)
+        self.output = Linear(hidden_dim, action_dim)
 
     def forward(self, x: th.Tensor, film: th.Tensor) -> th.Tensor:
         """
@@ -95,7 +97,7 @@ class VectorField(FilmNetwork):
     ) -> None:
         super().__init__(action_dim, condition_dim, hidden_dim, n_layers)
         self.time_embedding_dim = time_embedding_dim
-        self.film_time = nn.Linear(time_embedding_dim, self.film_dim, bias=False)
+        self.film_time = Linear(time_embedding_dim, self.film_dim, bias=False)
 
     def time_share(self, tau: th.Tensor) -> th.Tensor:
         """The share of times in [0, 1], (...), in all scales and shifts: (..., 2 * hidden_dim * n_layers)."""

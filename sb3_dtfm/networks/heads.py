@@ -4,6 +4,7 @@ import torch as th
 from torch import nn
 
 from sb3_dtfm.networks.flow import ONE_STEP, FilmNetwork, VectorField, integrate, interpolate, solver_times
+from sb3_dtfm.networks.linear import Linear
 
 # Solver steps whose end the one-step network learns.
 DISTILLED_STEPS = 16
@@ -30,7 +31,7 @@ class RegressionHead(nn.Module):
 
     def __init__(self, embed_dim: int, action_dim: int) -> None:
         super().__init__()
-        self.linear = nn.Linear(embed_dim, action_dim)
+        self.linear = Linear(embed_dim, action_dim)
 
     def loss(self, hidden: th.Tensor, actions: th.Tensor, mask: th.Tensor) -> th.Tensor:
         """

@@ -5,6 +5,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_dtfm.networks.dropout import dropout, dropout_add
+from sb3_dtfm.networks.linear import Linear
 
 ALL = slice(None)
 
@@ -17,11 +18,11 @@ class TransformerBlock(nn.Module):
         self.n_heads = n_heads
         self.dropout = dropout
         self.attention_norm = nn.LayerNorm(embed_dim)
-        self.attention_in = nn.Linear(embed_dim, 3 * embed_dim)
-        self.attention_out = nn.Linear(embed_dim, embed_dim)
+        self.attention_in = Linear(embed_dim, 3 * embed_dim)
+        self.attention_out = Linear(embed_dim, embed_dim)
         self.mlp_norm = nn.LayerNorm(embed_dim)
-        self.mlp_in = nn.Linear(embed_dim, 4 * embed_dim)
-        self.mlp_out = nn.Linear(4 * embed_dim, embed_dim)
+        self.mlp_in = Linear(embed_dim, 4 * embed_dim)
+        self.mlp_out = Linear(4 * embed_dim, embed_dim)
 
     def forward(self, tokens: th.Tensor, attention_bias: th.Tensor, queries: slice = ALL) -> th.Tensor:
         """
@@ -120,9 +121,9 @@ class SequenceTrunk(nn.Module):
         self.embed_dim = embed_dim
         self.n_layers = n_layers
         self.n_heads = n_heads
-        self.embed_return_to_go = nn.Linear(1, embed_dim)
-        self.embed_observation = nn.Linear(observation_dim, embed_dim)
-        self.embed_action = nn.Linear(action_dim, embed_dim)
+        self.embed_return_to_go = Linear(1, embed_dim)
+        self.embed_observation = Linear(observation_dim, embed_dim)
+        self.embed_action = Linear(action_dim, embed_dim)
         self.embed_timestep = nn.Embedding(max_timestep, embed_dim)
         self.dropout = dropout
         self.blocks = nn.ModuleList(TransformerBlock(embed_dim, n_heads, dropout) for _ in range(n_layers))
