@@ -22,7 +22,7 @@ class Linear(nn.Linear):
     def forward(self, x: th.Tensor) -> th.Tensor:
         """From (..., in_features) to (..., out_features)."""
         n_rows = x.numel() // self.in_features
-        if n_rows > FEW_ROWS or x.device.type != "cpu" or x.dtype != th.float32 or th.is_grad_enabled():
+        if not 0 < n_rows <= FEW_ROWS or x.device.type != "cpu" or x.dtype != th.float32 or th.is_grad_enabled():
             return F.linear(x, self.weight, self.bias)
         weight = self.weight.detach().numpy()
         y = np.empty((n_rows, self.out_features), np.float32)
