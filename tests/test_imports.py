@@ -14,11 +14,14 @@ ROOMS = {
     "context": ("sb3_dtfm/context.py", set()),
     "envs": ("envs", {"envs"}),
     "data": ("sb3_dtfm/data", {"data", "envs"}),
-    "policies": ("sb3_dtfm/policies.py", {"networks", "context"}),
+    "policies": ("sb3_dtfm/policies", {"networks", "context", "policies"}),
     "callbacks": ("sb3_dtfm/callbacks.py", {"data"}),
     "optimization": ("sb3_dtfm/optimization.py", set()),
     "distributed": ("sb3_dtfm/distributed.py", set()),
-    "algorithms": ("sb3_dtfm/algorithms.py", {"policies", "data", "envs", "callbacks", "optimization", "distributed"}),
+    "algorithms": (
+        "sb3_dtfm/algorithms",
+        {"algorithms", "policies", "data", "envs", "callbacks", "optimization", "distributed"},
+    ),
     "zoo": ("sb3_dtfm/zoo", {"", "data", "envs", "distributed", "zoo"}),
 }
 
@@ -56,7 +59,7 @@ def test_a_room_imports_only_the_rooms_below_it(room):
 
 
 def test_networks_need_torch_and_numpy_alone():
-    standard = {"collections", "dataclasses", "math", "typing", "__future__", "abc", "functools"}
+    standard = {"collections", "contextlib", "dataclasses", "math", "typing", "__future__", "abc", "functools"}
     for path in files("networks"):
         roots = {module.split(".")[0] for module in imported_modules(path)}
         assert roots <= standard | {"torch", "numpy", PACKAGE}, path

@@ -1,4 +1,4 @@
-"""The policies: normalisation, context and acting in one place; `DTPolicy` and `DTFMPolicy` differ in their head only."""
+"""What every policy shares: normalisation, context, acting, optimiser."""
 
 import copy
 from abc import abstractmethod
@@ -12,17 +12,12 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_dtfm.context import Context, empty_context, push, unpack_observation, with_action
-from sb3_dtfm.networks.flow import ONE_STEP, check_solver
-from sb3_dtfm.networks.heads import FlowHead, RegressionHead
+from sb3_dtfm.networks.heads import RegressionHead
 from sb3_dtfm.networks.linear import threads_for
 from sb3_dtfm.networks.trunk import SequenceTrunk
 
 # Observations are clipped at this many standard deviations, as SB3's VecNormalize does.
 OBSERVATION_CLIP = 10.0
-# Steps after which deterministic acting repeats its noise; longer than a usual episode.
-NOISE_PERIOD = 1024
-# Newest steps of each window that the one-step network learns from: where acting asks it, and few enough to cost little.
-ONE_STEP_POSITIONS = 4
 
 
 class SequenceTensors(NamedTuple):
@@ -233,7 +228,7 @@ class SequencePolicy(BasePolicy):
         with th.no_grad():
             windows = self.scaled_windows(batch)
             hidden = self.hidden_states(self.acting_network, windows, last_only=True).squeeze(1)
-            actions = self._generate(hidden, _standard_normal(len(hidden), self.action_dim, generator)).clamp(-1.0, 1.0)
+            actions = self._generate(hidden, standard_normal(len(hidden), self.action_dim, generator)).clamp(-1.0, 1.0)
             return (actions - windows.actions[:, -1]).square().mean()
 
     def update_ema(self, decay: float) -> None:
@@ -363,143 +358,5 @@ class SequencePolicy(BasePolicy):
         )
 
 
-class DTPolicy(SequencePolicy):
-    """Decision Transformer: the action is regressed from the hidden state, bounded by tanh."""
-
-    def _make_head(self) -> RegressionHead:
-        return RegressionHead(self.embed_dim, self.action_dim)
-
-    @staticmethod
-    def _head(network: SequenceNetwork) -> RegressionHead:
-        assert isinstance(network.head, RegressionHead)
-        return network.head
-
-    def compute_loss(self, batch: Any, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        windows = self.scaled_windows(batch)
-        hidden = self.hidden_states(self.network, windows)
-        loss = self._head(self.network).loss(hidden, windows.actions, windows.mask)
-        return loss, {"regression_loss": loss}
-
-    def _generate(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
-        return self._head(self.acting_network)(hidden)
-
-
-class DTFMPolicy(SequencePolicy):
-    """
-    Decision Transformer with flow matching: the hidden state conditions a vector field from noise to action.
-
-    `deterministic=True` starts from noise that belongs to the time step: drawn once from `seed`, saved with the model.
-    Zero noise would be one point of the distribution, and following the same mode for ever gets an arm stuck.
-
-    :param flow_hidden_dim: width of the vector field's hidden layers
-    :param flow_n_layers: number of its hidden layers
-    :param solver: how to act: an ODE solver, euler, midpoint, heun or rk4; or one_step, the network that learnt its end
-    :param n_solver_steps: steps of the ODE solver
-    :param one_step: train that network; a few percent of a gradient step, no influence on the rest
-    :param regression_coef: weight of the auxiliary action regression; 0 leaves it out
-
-    The other parameters are those of :class:`SequencePolicy`.
-    """
-
-    noise_table: th.Tensor
-
-    def __init__(
-        self,
-        *args: Any,
-        flow_hidden_dim: int = 512,
-        flow_n_layers: int = 3,
-        solver: str = "euler",
-        n_solver_steps: int = 50,
-        one_step: bool = True,
-        regression_coef: float = 0.0,
-        **kwargs: Any,
-    ) -> None:
-        self.flow_hidden_dim = flow_hidden_dim
-        self.flow_n_layers = flow_n_layers
-        self.solver = solver
-        self.n_solver_steps = n_solver_steps
-        self.one_step = one_step
-        self.regression_coef = regression_coef
-        super().__init__(*args, **kwargs)
-        noise_generator = th.Generator().manual_seed(0 if self.seed is None else self.seed)
-        self.register_buffer("noise_table", _standard_normal(NOISE_PERIOD, self.action_dim, noise_generator))
-        self._acting_generator: th.Generator | None = None
-
-    def _make_head(self) -> FlowHead:
-        self._check_solver(self.solver, self.n_solver_steps)
-        return FlowHead(self.embed_dim, self.action_dim, self.flow_hidden_dim, self.flow_n_layers, self.one_step)
-
-    @staticmethod
-    def _head(network: SequenceNetwork) -> FlowHead:
-        assert isinstance(network.head, FlowHead)
-        return network.head
-
-    def _make_auxiliary_head(self) -> RegressionHead | None:
-        return RegressionHead(self.embed_dim, self.action_dim) if self.regression_coef > 0 else None
-
-    def draw_noise(self, batch: Any, generator: th.Generator) -> tuple[th.Tensor, ...]:
-        noise = th.randn(batch.actions.shape, generator=generator, device=batch.actions.device)
-        tau = th.rand(batch.mask.shape, generator=generator, device=batch.mask.device)
-        return noise, tau
-
-    def compute_loss(self, batch: Any, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        starts, tau = noise
-        windows = self.scaled_windows(batch)
-        hidden = self.hidden_states(self.network, windows)
-        head = self._head(self.network)
-        parts = {"flow_loss": head.loss(hidden, windows.actions, windows.mask, starts, tau)}
-        loss = parts["flow_loss"]
-        if self.network.auxiliary_head is not None:
-            parts["regression_loss"] = self.network.auxiliary_head.loss(hidden, windows.actions, windows.mask)
-            loss = loss + self.regression_coef * parts["regression_loss"]
-        if self.one_step:
-            newest = slice(-ONE_STEP_POSITIONS, None)
-            parts["one_step_loss"] = head.one_step_loss(hidden[:, newest], windows.mask[:, newest], starts[:, newest])
-            loss = loss + parts["one_step_loss"]
-        return loss, parts
-
-    def part_masks(self, mask: th.Tensor) -> dict[str, th.Tensor]:
-        return {"one_step_loss": mask[:, -ONE_STEP_POSITIONS:]} if self.one_step else {}
-
-    def clipped_parameters(self) -> list[nn.Parameter]:
-        """All but the one-step network's: it must not change how the others are clipped."""
-        return [p for name, p in self.network.named_parameters() if not name.startswith("head.jump")]
-
-    def _generate(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
-        return self._head(self.acting_network)(hidden, noise, self.solver, self.n_solver_steps)
-
-    def _check_solver(self, solver: str, n_solver_steps: int) -> None:
-        check_solver(solver, n_solver_steps)
-        if solver == ONE_STEP and not self.one_step:
-            raise ValueError(f"solver={ONE_STEP!r} needs a model that was trained with policy_kwargs=dict(one_step=True).")
-
-    def set_solver(self, solver: str, n_solver_steps: int = 1) -> None:
-        """
-        Choose how to act; the trained weights do not depend on it.
-
-        :param solver: euler, midpoint, heun or rk4, or one_step: a single evaluation of the network that learnt their end
-        :param n_solver_steps: steps of the ODE solver
-        :raises ValueError: unknown solver, fewer than one step, or one_step of a model that did not learn it
-        """
-        self._check_solver(solver, n_solver_steps)
-        self.solver = solver
-        self.n_solver_steps = n_solver_steps
-
-    def _acting_noise(self, timestep: th.Tensor, deterministic: bool) -> th.Tensor:
-        if deterministic:
-            return self.noise_table[timestep % NOISE_PERIOD]
-        if self._acting_generator is None:
-            self._acting_generator = th.Generator(self.device)
-            if self.seed is None:
-                self._acting_generator.seed()
-            else:
-                self._acting_generator.manual_seed(self.seed)
-        return _standard_normal(len(timestep), self.action_dim, self._acting_generator)
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        names = ("flow_hidden_dim", "flow_n_layers", "solver", "n_solver_steps", "one_step", "regression_coef")
-        return {**super()._get_constructor_parameters(), **{name: getattr(self, name) for name in names}}
-
-
-def _standard_normal(n_rows: int, dim: int, generator: th.Generator) -> th.Tensor:
+def standard_normal(n_rows: int, dim: int, generator: th.Generator) -> th.Tensor:
     return th.randn(n_rows, dim, generator=generator, device=generator.device)

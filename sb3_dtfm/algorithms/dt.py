@@ -1,0 +1,18 @@
+"""Decision Transformer."""
+
+from typing import ClassVar
+
+from stable_baselines3.common.policies import BasePolicy
+
+from sb3_dtfm.algorithms.offline import OfflineSequenceAlgorithm
+from sb3_dtfm.policies import DTPolicy
+
+
+class DT(OfflineSequenceAlgorithm):
+    """
+    Decision Transformer (Chen et al., 2021): the action is regressed, under a tanh, from the trunk's hidden state.
+
+    Parameters are those of :class:`OfflineSequenceAlgorithm`.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": DTPolicy}
