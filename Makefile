@@ -1,16 +1,19 @@
 .DELETE_ON_ERROR:
-.PHONY: help install demo test format lint type clean
+.PHONY: help install demo test bench format lint type clean
 
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
+# d3rlpy needs another gymnasium.
+PEERS := .venv-peers
 # What is checked and formatted besides the package.
-SOURCES := sb3_dtfm envs zoo_configs tests
+SOURCES := sb3_dtfm envs zoo_configs tests benchmarks
 
 help:
 	@echo "make install  pinned environment in $(VENV), for Python 3.10 to 3.12"
 	@echo "make demo     record, train and evaluate on robosuite's Lift: at most 15 minutes on 2 cores"
 	@echo "make test     the fast tests"
+	@echo "make bench    DTFM beside d3rlpy, training and acting: 10 minutes on 2 idle cores"
 	@echo "make format   rewrite the sources in the project's format"
 	@echo "make lint     check format and style"
 	@echo "make type     check types"
@@ -48,6 +51,15 @@ demo: install
 test: install
 	$(BIN)/python -m pytest -n 2 --durations=10
 
+bench: install $(PEERS)/installed
+	$(BIN)/python benchmarks/compare.py --peer-python $(PEERS)/bin/python
+
+$(PEERS)/installed: constraints.txt
+	rm -rf $(PEERS)
+	$(BIN)/python -m venv $(PEERS)
+	$(PEERS)/bin/pip install --disable-pip-version-check --quiet $$(grep '^torch==' constraints.txt) d3rlpy==2.8.1
+	@touch $@
+
 format: install
 	$(BIN)/ruff format $(SOURCES)
 	$(BIN)/ruff check --fix $(SOURCES)
@@ -64,4 +76,4 @@ type: install
 	cd build/typing && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(PEERS) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -1,5 +1,5 @@
 """
-DTFM beside its peer d3rlpy, in turn on one machine: `make benchmark`.
+DTFM beside its peer d3rlpy, in turn on one machine: `make bench`.
 
 Prints docs/performance.md's tables of training and acting: medians over repeats, each in a process of its own, and ratios
 of the medians. Peers come from PyPI in an environment of their own.
