@@ -22,24 +22,26 @@ from worker import BATCH_SIZE, CONTEXT_LENGTH, make_model
 HERE = Path(__file__).parent
 SIZES = {"width 128, 3 layers": (128, 3, 15), "width 256, 10 layers": (256, 10, 5)}
 N_ACTIONS = 100
-# Name: solver, its steps, keys and values kept, environments.
+# Name: solver, its steps, keys and values kept, environments, time step of the first action.
 ACTING = {
-    "50 Euler steps": ("euler", 50, 0, 1),
-    "10 Euler steps": ("euler", 10, 0, 1),
-    "one step": ("one_step", 1, 0, 1),
-    "50 Euler steps, kv_cache": ("euler", 50, 1, 1),
-    "10 Euler steps, kv_cache": ("euler", 10, 1, 1),
-    "one step, kv_cache": ("one_step", 1, 1, 1),
-    "50 Euler steps, kv_cache, 16 environments": ("euler", 50, 1, 16),
-    "one step, kv_cache, 16 environments": ("one_step", 1, 1, 16),
-    "one step, 16 environments": ("one_step", 1, 0, 16),
+    "50 Euler steps": ("euler", 50, 0, 1, 0),
+    "10 Euler steps": ("euler", 10, 0, 1, 0),
+    "one step": ("one_step", 1, 0, 1, 0),
+    "50 Euler steps, kv_cache": ("euler", 50, 1, 1, 0),
+    "10 Euler steps, kv_cache": ("euler", 10, 1, 1, 0),
+    "one step, kv_cache": ("one_step", 1, 1, 1, 0),
+    "one step, kv_cache, from time step 10,000": ("one_step", 1, 1, 1, 10_000),
+    "50 Euler steps, kv_cache, 16 environments": ("euler", 50, 1, 16, 0),
+    "one step, kv_cache, 16 environments": ("one_step", 1, 1, 16, 0),
+    "one step, 16 environments": ("one_step", 1, 0, 16, 0),
 }
 
 
 def measure(python: str, worker: str, *arguments: object) -> dict[str, float]:
     """One measurement in a fresh process."""
     command = [python, str(HERE / worker), *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}  # set by our import
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     if done.returncode:
         sys.exit(f"{' '.join(command)} failed:\n{done.stderr}")
     return json.loads(done.stdout.splitlines()[-1])
@@ -112,7 +114,6 @@ def main() -> None:
     parser.add_argument("--peer-python", required=True, help="Python of an environment with d3rlpy and the same torch")
     parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args()
-    os.environ.setdefault("OMP_WAIT_POLICY", "ACTIVE")  # the machine is the benchmark's alone: torch's own default, for both
     commit = subprocess.run(
         ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, cwd=HERE, check=False
     )

@@ -1,8 +1,8 @@
 """
 Measure DTFM; run by `compare.py`, each measurement in a process of its own.
 
-`python worker.py train WIDTH LAYERS N` or `python worker.py act WIDTH LAYERS N SOLVER SOLVER_STEPS KV_CACHE N_ENVS` prints
-one line of JSON.
+`python worker.py train WIDTH LAYERS N` or `python worker.py act WIDTH LAYERS N SOLVER SOLVER_STEPS KV_CACHE N_ENVS FIRST`
+prints one line of JSON.
 """
 
 import json
@@ -59,9 +59,9 @@ def train(width: int, n_layers: int, n_steps: int) -> dict[str, float]:
 
 
 def act(
-    width: int, n_layers: int, n: int, solver: str, n_solver_steps: int, kv_cache: bool, n_envs: int
+    width: int, n_layers: int, n: int, solver: str, n_solver_steps: int, kv_cache: bool, n_envs: int, first: int
 ) -> dict[str, float]:
-    """Median time of `predict` with a full context."""
+    """Median time of `predict` with a full context, in episodes seen from time step `first` on."""
     model = make_model(width, n_layers, solver=solver, n_solver_steps=n_solver_steps, kv_cache=kv_cache)
     rng = np.random.default_rng(0)
     state, times = None, []
@@ -69,7 +69,7 @@ def act(
         observation = {
             "observation": rng.normal(size=(n_envs, OBSERVATION_DIM)).astype(np.float32),
             "return_to_go": np.ones((n_envs, 1), np.float32),
-            "timestep": np.full((n_envs, 1), t),
+            "timestep": np.full((n_envs, 1), first + t),
         }
         start = time.perf_counter()
         _, state = model.predict(observation, state=state, deterministic=True)
@@ -92,8 +92,8 @@ def main() -> None:
     if what == "train":
         result = train(width, n_layers, n)
     else:
-        solver, n_solver_steps, kv_cache, n_envs = sys.argv[5], *map(int, sys.argv[6:9])
-        result = act(width, n_layers, n, solver, n_solver_steps, bool(kv_cache), n_envs)
+        solver, n_solver_steps, kv_cache, n_envs, first = sys.argv[5], *map(int, sys.argv[6:10])
+        result = act(width, n_layers, n, solver, n_solver_steps, bool(kv_cache), n_envs, first)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(json.dumps({**result, "peak_mib": peak, "version": sb3_dtfm.__version__, "torch": th.__version__}))
 
