@@ -284,8 +284,9 @@ class SequencePolicy(BasePolicy):
         """The newest step's actions, (B, A) in [-1, 1], and the keys and values to keep."""
         if self.training:
             self.set_training_mode(False)  # goes through all modules
+        device = self.device  # SB3 looks for it among the parameters each time
         with th.inference_mode():
-            *window, keys_values = (th.from_numpy(array).to(self.device) for array in context)
+            *window, keys_values = (th.from_numpy(array).to(device) for array in context)
             windows = SequenceTensors(*window)
             if self.kv_cache and self.context_length > 1:
                 hidden, keys_values = self._extend(self._normalized(windows), keys_values)
