@@ -322,10 +322,10 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         loss, parts = parallel.compute_loss(batch, *self.policy.draw_noise(batch, generator))
         next_ends = buffer.draw(self.batch_size, generator)
         buffer.prefetch(next_ends, self.context_length)
-        self.policy.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.clipped_parameters(), self.max_grad_norm or math.inf)
         self.policy.optimizer.step()
+        self.policy.optimizer.zero_grad(set_to_none=True)  # not before the next loss, which has the most in memory
         self._n_updates += 1
         if self.ema_decay > 0:
             # A young average follows more closely, or the random start would stay in it for long.
