@@ -318,6 +318,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         """
         self.policy.set_training_mode(True)  # an evaluation in between leaves evaluation mode on
         self._update_learning_rate(self.policy.optimizer)
+        self.policy.optimizer.zero_grad(set_to_none=True)  # before the loss, which has the most in memory
         batch = buffer.windows(ends, self.context_length)
         loss, parts = parallel.compute_loss(batch, *self.policy.draw_noise(batch, generator))
         next_ends = buffer.draw(self.batch_size, generator)
@@ -325,7 +326,6 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         loss.backward()
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.clipped_parameters(), self.max_grad_norm or math.inf)
         self.policy.optimizer.step()
-        self.policy.optimizer.zero_grad(set_to_none=True)  # not before the next loss, which has the most in memory
         self._n_updates += 1
         if self.ema_decay > 0:
             # A young average follows more closely, or the random start would stay in it for long.
