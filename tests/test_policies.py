@@ -208,6 +208,29 @@ def test_a_cache_that_starts_in_mid_episode_is_filled_from_the_window(model):
     assert np.allclose(*actions, atol=1e-4)
 
 
+def test_predict_with_a_cache_is_a_pure_function(model):
+    """Also over many steps, and when an old state is taken up again: what one call appends, another never sees."""
+    model.policy.kv_cache = True
+    observation, _ = make_env().reset(seed=0)
+
+    def go_on(state, first, n_steps, shift):
+        actions = []
+        for t in range(first, first + n_steps):
+            moved = {**observation, "observation": observation["observation"] + shift, "timestep": np.array([t])}
+            action, state = model.predict(moved, state=state, deterministic=True)
+            actions.append(action)
+        return np.array(actions), state
+
+    _, state = go_on(None, 0, 7, 0.0)
+    copies = [array.copy() for array in state]
+    once, _ = go_on(state, 7, 50, 0.0)
+    other, _ = go_on(state, 7, 50, 0.5)
+    again, _ = go_on(state, 7, 50, 0.0)
+    assert np.array_equal(once, again)
+    assert not np.allclose(once, other)
+    assert all(np.array_equal(array, copy) for array, copy in zip(state, copies, strict=True))
+
+
 def test_parallel_environments_with_a_cache_act_as_they_would_alone(model):
     model.policy.kv_cache = True
     test_parallel_environments_act_as_they_would_alone(model)

@@ -180,8 +180,8 @@ class SequenceTrunk(nn.Module):
         returns_to_go: th.Tensor,
         timesteps: th.Tensor,
         mask: th.Tensor,
-        kept: th.Tensor,
-    ) -> tuple[th.Tensor, th.Tensor]:
+        keys_values: th.Tensor,
+    ) -> th.Tensor:
         """
         The newest step's hidden state from what earlier steps left behind: three new tokens instead of a whole window.
 
@@ -191,8 +191,9 @@ class SequenceTrunk(nn.Module):
         band of K steps over the whole episode from then on.
 
         :param observations: (B, K, O), and the others as for :meth:`forward`; the last two steps are read
-        :param kept: (B, layers, 2, 3 (K - 1), D), keys and values of the K - 1 steps before; anything where `mask` is False
-        :return: (B, D) hidden state, and what to keep for the next step, shaped like `kept`
+        :param keys_values: (B, layers, 2, 3 K, D), those of the K - 1 steps before, any finite number where `mask` is False;
+            the last three tokens' are filled in here
+        :return: (B, D) hidden state
         """
         time = self._time(timesteps[:, -2:])
         new = (
@@ -204,12 +205,10 @@ class SequenceTrunk(nn.Module):
         # In triples of action before, return-to-go, observation; the action before the oldest step is out of sight.
         seen = th.stack((F.pad(mask[:, :-1], (1, 0)), mask, mask), dim=2).flatten(1)
         attention_bias = self._attention_bias(causal_mask(seen)[:, :, -3:])
-        keys_values = kept.new_empty(*kept.shape[:3], kept.shape[3] + 3, self.embed_dim)
-        keys_values[:, :, :, :-3] = kept
         for block, block_keys_values in zip(self.blocks, keys_values.unbind(dim=1), strict=True):
             assert isinstance(block, TransformerBlock)
             tokens = block.extend(tokens, block_keys_values, attention_bias)
-        return self.final_norm(tokens[:, -1]), keys_values[:, :, :, 3:]
+        return self.final_norm(tokens[:, -1])
 
     def _time(self, timesteps: th.Tensor) -> th.Tensor:
         return self.embed_timestep(timesteps.clamp(max=self.embed_timestep.num_embeddings - 1))

@@ -15,6 +15,7 @@ from sb3_dtfm.context import Context, empty_context, push, unpack_observation, w
 from sb3_dtfm.networks.heads import RegressionHead
 from sb3_dtfm.networks.linear import threads_for
 from sb3_dtfm.networks.trunk import SequenceTrunk
+from sb3_dtfm.policies.kv_cache import TOKENS_PER_STEP, KeysValuesCache
 
 # Observations are clipped at this many standard deviations, as SB3's VecNormalize does.
 OBSERVATION_CLIP = 10.0
@@ -109,6 +110,7 @@ class SequencePolicy(BasePolicy):
         self.register_buffer("action_low", th.as_tensor(action_space.low), persistent=False)
         self.register_buffer("action_high", th.as_tensor(action_space.high), persistent=False)
         self._context: Context | None = None
+        self._keys_values = KeysValuesCache()
 
         trunk = SequenceTrunk(self.observation_dim, self.action_dim, max_timestep, embed_dim, n_layers, n_heads, dropout)
         self.network = SequenceNetwork(trunk, self._make_head(), self._make_auxiliary_head())
@@ -286,19 +288,18 @@ class SequencePolicy(BasePolicy):
             self.set_training_mode(False)  # goes through all modules
         device = self.device  # SB3 looks for it among the parameters each time
         with th.inference_mode():
-            *window, keys_values = (th.from_numpy(array).to(device) for array in context)
-            windows = SequenceTensors(*window)
+            windows = SequenceTensors(*(th.from_numpy(array).to(device) for array in context[:-1]))
             if self.kv_cache and self.context_length > 1:
-                hidden, keys_values = self._extend(self._normalized(windows), keys_values)
+                hidden, keys_values = self._extend(self._normalized(windows), context.keys_values)
             else:
                 hidden = self.hidden_states(self.acting_network, windows, last_only=True).squeeze(1)
-                keys_values = keys_values.new_zeros(len(hidden), 0)
+                keys_values = np.zeros((len(hidden), 0), np.float32)
             noise = self._acting_noise(windows.timesteps[:, -1], deterministic)
             with threads_for(len(hidden)):
                 actions = self._generate(hidden, noise).clamp(-1.0, 1.0)
-            return actions.cpu().numpy(), keys_values.cpu().numpy()
+            return actions.cpu().numpy(), keys_values
 
-    def _extend(self, windows: SequenceTensors, kept: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def _extend(self, windows: SequenceTensors, kept: np.ndarray) -> tuple[th.Tensor, np.ndarray]:
         """
         The newest hidden states from what was kept, and what to keep for the next step.
 
@@ -306,16 +307,19 @@ class SequencePolicy(BasePolicy):
         :param kept: (B, layers, 2, 3 (K - 1), D), or (B, 0) if the last steps were acted without a cache
         :return: (B, D) hidden states, and the new `kept`
         """
-        shape = (len(windows.mask), self.n_layers, 2, 3 * (self.context_length - 1), self.embed_dim)
-        trunk = self.acting_network.trunk
+        shape = (len(windows.mask), self.n_layers, 2, TOKENS_PER_STEP * (self.context_length - 1), self.embed_dim)
+        n_missing = 0
         if kept.shape != shape:
-            kept = th.zeros(shape, device=self.device)
-            for n_missing in range(int(windows.mask.sum(dim=1).max()) - 1, 0, -1):
-                earlier = SequenceTensors(*(x.roll(n_missing, dims=1) for x in windows))
-                earlier.mask[:, :n_missing] = False  # the newest steps went round to the left
-                _, kept = trunk.extend(*earlier, kept=kept)
-        with threads_for(3 * len(kept)):
-            return trunk.extend(*windows, kept=kept)
+            kept = np.zeros(shape, np.float32)
+            n_missing = int(windows.mask.sum(dim=1).max()) - 1
+        with threads_for(TOKENS_PER_STEP * len(kept)):
+            for n_back in range(n_missing, -1, -1):
+                earlier = SequenceTensors(*(x.roll(n_back, dims=1) for x in windows)) if n_back else windows
+                earlier.mask[:, :n_back] = False  # the newest steps went round to the left
+                keys_values = self._keys_values.with_next_step(kept, earlier.mask.device)
+                hidden = self.acting_network.trunk.extend(*earlier, keys_values=keys_values)
+                kept = self._keys_values.keep(keys_values)
+        return hidden, kept
 
     def _acting_noise(self, timestep: th.Tensor, deterministic: bool) -> th.Tensor:
         """

@@ -120,7 +120,9 @@ def keep_extending(trunk, window, n_steps):
             key: th.cat((th.zeros_like(value[:, :1].expand(-1, pad, *value.shape[2:])), value), 1)
             for key, value in seen.items()
         }
-        hidden, kept = trunk.extend(**padded, kept=kept)
+        keys_values = th.nn.functional.pad(kept, (0, 0, 0, 3))
+        hidden = trunk.extend(**padded, keys_values=keys_values)
+        kept = keys_values[:, :, :, 3:]
         hidden_states.append(hidden)
     return th.stack(hidden_states, dim=1)
 
