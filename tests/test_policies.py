@@ -248,6 +248,16 @@ def test_one_step_acting_is_one_evaluation_saved_with_the_model(cheetah_buffer, 
     assert not np.allclose(roll_plain(model, 8), roll_plain(loaded, 8))
 
 
+def test_a_way_of_acting_that_was_chosen_after_training_is_saved(cheetah_buffer, tmp_path):
+    model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=TINY_FLOW_POLICY, seed=0)
+    model.policy.set_solver("heun", 3)
+    model.policy.kv_cache = True
+    model.save(tmp_path / "model.zip")
+    loaded = DTFM.load(tmp_path / "model.zip")
+    assert (loaded.policy.solver, loaded.policy.n_solver_steps, loaded.policy.kv_cache) == ("heun", 3, True)
+    assert np.array_equal(roll_plain(model, 8), roll_plain(loaded, 8))
+
+
 def test_one_step_acting_needs_a_model_that_learned_it(cheetah_buffer):
     policy_kwargs = {**TINY_FLOW_POLICY, "one_step": False}
     model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=policy_kwargs, seed=0)

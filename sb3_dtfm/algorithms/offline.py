@@ -59,7 +59,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
     :param ema_decay: decay of the exponential moving average of weights that acts; 0 acts with the trained weights
     :param precision: "float32", "bfloat16" (autocast), or "auto": bfloat16 where the hardware multiplies in it
     :param compile: compile the loss with `torch.compile`; None does so on a GPU. It takes a minute, and a C++ compiler
-    :param policy_kwargs: arguments of the policy, for example `embed_dim`, `n_layers`, `n_heads`, `dropout`
+    :param policy_kwargs: arguments of the policy, for example `embed_dim`, `n_layers`, `n_heads`, `dropout`, `kv_cache`
     :param stats_window_size: as in SB3; offline learning collects no episodes
     :param tensorboard_log: folder of the TensorBoard log, None for no log
     :param verbose: 0 silent, 1 prints the log

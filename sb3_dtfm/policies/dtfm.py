@@ -127,6 +127,9 @@ class DTFMPolicy(SequencePolicy):
                 self._acting_generator.manual_seed(self.seed)
         return standard_normal(len(timestep), self.action_dim, self._acting_generator)
 
+    def _acting_settings(self) -> dict[str, Any]:
+        return {**super()._acting_settings(), "solver": self.solver, "n_solver_steps": self.n_solver_steps}
+
     def _get_constructor_parameters(self) -> dict[str, Any]:
         names = ("flow_hidden_dim", "flow_n_layers", "solver", "n_solver_steps", "one_step", "regression_coef")
         return {**super()._get_constructor_parameters(), **{name: getattr(self, name) for name in names}}

@@ -1,6 +1,7 @@
 """What every policy shares: normalisation, context, acting, optimiser."""
 
 import copy
+import json
 from abc import abstractmethod
 from typing import Any, NamedTuple
 
@@ -341,6 +342,18 @@ class SequencePolicy(BasePolicy):
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(observation, deterministic)
+
+    def _acting_settings(self) -> dict[str, Any]:
+        """How to act: attributes that may change after training."""
+        return {"kv_cache": self.kv_cache}
+
+    def get_extra_state(self) -> th.Tensor:
+        """The settings of acting as JSON, to be saved with the weights; in a tensor, as all of a state dict is."""
+        return th.tensor(list(json.dumps(self._acting_settings()).encode()), dtype=th.uint8)
+
+    def set_extra_state(self, state: th.Tensor) -> None:
+        for name, value in json.loads(bytes(state.tolist())).items():
+            setattr(self, name, value)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         names = (
