@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from rl_zoo3.utils import StoreDict
 
 from sb3_dtfm.benchmark.provenance import describe_data
 from sb3_dtfm.benchmark.rows import Cell, finished_cells, merge_rows, result_files
@@ -95,8 +94,8 @@ def benchmark_parser() -> argparse.ArgumentParser:
         "-params",
         "--hyperparams",
         nargs="+",
-        action=StoreDict,
-        default={},
+        action="extend",
+        default=[],
         help="settings to change, key:value; needs --label",
     )
     training(
@@ -134,8 +133,22 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
             raise UsageError(f"--seeds: must be 0 or more, got {seed}.")
     if options.hyperparams and not options.label:
         raise UsageError("-params: needs --label, or the rows would pass for the profile's own.")
-    options.hyperparams = {**options.hyperparams, **_cache_kwargs(options)}
+    options.hyperparams = dict(_hyperparam(text) for text in options.hyperparams)
+    options.hyperparams.update(_cache_kwargs(options))
     return options
+
+
+def _hyperparam(text: str) -> tuple[str, Any]:
+    """
+    Key and value, which is Python as in RL-Zoo's `-params`.
+
+    :raises UsageError: it cannot be evaluated
+    """
+    key, _, value = text.partition(":")
+    try:
+        return key, eval(value, {})
+    except Exception as error:  # whatever the user's expression raises
+        raise UsageError(f"-params {text}: expected key:value with a value in Python ({error}).") from error
 
 
 def _cache_kwargs(options: argparse.Namespace) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from sb3_dtfm.benchmark.grid import Job, parse_arguments, plan
 from sb3_dtfm.benchmark.provenance import n_cores
 from sb3_dtfm.benchmark.rows import RowError, finished_cells, read_rows
 
+CELL_MODULE = "sb3_dtfm.benchmark.cell"
 POLL_INTERVAL = 0.2  # seconds
 PATIENCE = 10.0  # seconds that a process has to end after SIGTERM
 
@@ -117,7 +118,7 @@ class Runner:
         folder = Path(tempfile.mkdtemp(prefix="attempt-", dir=self.logs / name))
         (folder / SPEC).write_text(json.dumps(self._spec(job, folder)))
         (folder / "settings.yml").write_text(yaml.safe_dump({job.cell.task: job.settings}))
-        command = [sys.executable, "-m", "sb3_dtfm.benchmark.cell", str(folder / SPEC)]
+        command = [sys.executable, "-m", CELL_MODULE, str(folder / SPEC)]
         environment = {key: value for key, value in os.environ.items() if key not in ("RANK", "WORLD_SIZE")}
         environment["OMP_NUM_THREADS"] = str(self._n_threads())
         with (folder / OUTPUT).open("wb") as output:

@@ -117,7 +117,12 @@ def task_settings(
     missing = [option for key, option in needed.items() if key not in settings]
     if missing:
         raise UsageError(f"{', '.join(missing)}: needed for {task.env_id}, which --profile {profile} does not list.")
-    return {**settings, "dataset_fraction": regime, "dataset_seed": 0}
+    settings.update(dataset_fraction=regime, dataset_seed=0)
+    try:
+        yaml.safe_dump(settings)
+    except yaml.YAMLError as error:
+        raise UsageError(f"{task.env_id}: a setting that YAML cannot hold: {' '.join(str(error).split())}") from error
+    return settings
 
 
 def check_same_trunk(settings: dict[str, dict[str, Any]], task: str) -> None:

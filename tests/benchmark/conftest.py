@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 
 from sb3_dtfm.benchmark.rows import Row
+from tests.zoo.conftest import minari_folder, workplace
 
 
 def make_row(**changes: Any) -> Row:
@@ -43,3 +44,6 @@ def make_row(**changes: Any) -> Row:
 def row() -> Row:
     """One row."""
     return make_row()
+
+
+__all__ = ["make_row", "minari_folder", "row", "workplace"]
