@@ -38,6 +38,8 @@ class Clock:
         """
         if n_done == 0:
             return "time to go not known yet"
+        if n_done >= self.n_steps:  # evaluations may still take a while
+            return "finishing"
         return f"about {duration((self.n_steps - n_done) * (time.monotonic() - self._start) / n_done)} to go"
 
 
@@ -85,6 +87,10 @@ class PlainDisplay:
             print(f"{cell}: step {step:,} of {n_steps:,}, {what}; {n_done} of {self.n_cells} cells, {remaining}", flush=True)
 
 
+def _short(cell: Cell) -> str:
+    return f"{cell.task} {cell.regime:.0%} {cell.algo} seed {cell.seed} {cell.label}".strip()
+
+
 class RichDisplay:
     """
     A bar for the grid and one for each running cell.
@@ -93,7 +99,7 @@ class RichDisplay:
     """
 
     def __init__(self, n_cells: int) -> None:
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[what]}"))
+        columns = (TextColumn("{task.description}"), BarColumn(12), MofNCompleteColumn(), TextColumn("{task.fields[what]}"))
         self._progress = Progress(*columns, console=Console())
         self._grid = self._progress.add_task("cells", total=n_cells, what="")
         self._bars: dict[Cell, TaskID] = {}
@@ -114,7 +120,7 @@ class RichDisplay:
             self._progress.remove_task(self._bars.pop(cell))
         for cell, (step, n_steps, what) in running.items():
             if cell not in self._bars:
-                self._bars[cell] = self._progress.add_task(str(cell), total=n_steps, what=what)
+                self._bars[cell] = self._progress.add_task(_short(cell), total=n_steps, what=what)
             self._progress.update(self._bars[cell], completed=step, what=what)
 
 

@@ -140,9 +140,7 @@ class EvaluationCallback(BaseCallback):
         self._training_seconds += time.perf_counter() - self._resumed
         what = "final evaluation" if final else "evaluation"
         seeds = range(first_seed, first_seed + n_episodes)
-        episodes = evaluate(
-            self.model, self.vec_env, seeds, lambda n_done: self._report(f"{what}, {n_done} of {n_episodes} episodes")
-        )
+        episodes = evaluate(self.model, self.vec_env, seeds, lambda n_done: self._report(f"{what} {n_done}/{n_episodes}"))
         self.write(
             dict(
                 step=self.num_timesteps,

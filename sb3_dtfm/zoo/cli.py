@@ -100,7 +100,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     :return: exit code: 0, or 2 after a user's mistake
     """
     options = _parser().parse_args(argv)
-    if options.command in ("train", "enjoy", "demo", "benchmark") and importlib.util.find_spec("rl_zoo3") is None:
+    if options.command in ("train", "enjoy", "demo", "benchmark", "report") and importlib.util.find_spec("rl_zoo3") is None:
         return _fail(options.command, 'needs RL-Zoo: pip install "sb3-dtfm[zoo]"')
     try:
         COMMANDS[options.command](options.arguments)
