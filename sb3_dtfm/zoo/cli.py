@@ -65,12 +65,28 @@ def plot(argv: Sequence[str]) -> None:
     plot_run(argv)
 
 
+def benchmark(argv: Sequence[str]) -> None:
+    """Compare DT and DTFM on a grid of tasks, shares of the data and seeds."""
+    from sb3_dtfm.benchmark.runner import main as run_benchmark
+
+    run_benchmark(argv)
+
+
+def report(argv: Sequence[str]) -> None:
+    """Make tables and figures from the results of `benchmark`."""
+    from sb3_dtfm.benchmark.report import main as write_report
+
+    write_report(argv)
+
+
 COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {
     "train": train,
     "enjoy": enjoy,
     "record": record,
     "demo": demo,
     "plot": plot,
+    "benchmark": benchmark,
+    "report": report,
 }
 
 
@@ -84,7 +100,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     :return: exit code: 0, or 2 after a user's mistake
     """
     options = _parser().parse_args(argv)
-    if options.command in ("train", "enjoy", "demo") and importlib.util.find_spec("rl_zoo3") is None:
+    if options.command in ("train", "enjoy", "demo", "benchmark", "report") and importlib.util.find_spec("rl_zoo3") is None:
         return _fail(options.command, 'needs RL-Zoo: pip install "sb3-dtfm[zoo]"')
     try:
         COMMANDS[options.command](options.arguments)
@@ -96,7 +112,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    lines = [f"  {name:8}{command.__doc__}" for name, command in COMMANDS.items()]
+    lines = [f"  {name:10}{command.__doc__}" for name, command in COMMANDS.items()]
     parser = argparse.ArgumentParser(
         prog="sb3-dtfm",
         description="Offline reinforcement learning for Stable-Baselines3.",

@@ -1,0 +1,115 @@
+"""Where a row comes from: the code, the machine, and the data."""
+
+import json
+import os
+import platform
+import subprocess
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import h5py
+import minari
+import numpy as np
+import torch as th
+
+import sb3_dtfm
+from sb3_dtfm.data import load_dataset
+
+PACKAGES = ("sb3-dtfm", "torch", "stable-baselines3", "rl_zoo3", "gymnasium", "mujoco", "robosuite", "numpy")
+GIT_TIMEOUT = 20  # seconds
+
+
+def commit() -> str | None:
+    """Commit of this package's sources, with "-dirty" if they were changed since; None outside a git checkout."""
+    folder = Path(sb3_dtfm.__file__).parent
+    head = _git(folder, "rev-parse", "HEAD")
+    tracked = head and _git(folder, "ls-files", "--error-unmatch", Path(sb3_dtfm.__file__).name)
+    if not tracked:  # a package inside someone else's repository is not of its commit
+        return None
+    changed = _git(folder, "status", "--porcelain", "--untracked-files=no", ":/")
+    return f"{head}-dirty" if changed else head
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    command = ["git", "-C", str(folder), *arguments]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=GIT_TIMEOUT, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that results depend on."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def hardware(device: th.device) -> dict[str, Any]:
+    """
+    The machine that trains, without its name.
+
+    :param device: where the model is
+    """
+    return {
+        "cpu": _cpu_name(),
+        "cores": n_cores(),
+        "threads": th.get_num_threads(),
+        "gpu": th.cuda.get_device_name(device) if device.type == "cuda" else None,
+    }
+
+
+def n_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _cpu_name() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        names = [line.partition(":")[2].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
+        if names:
+            return names[0]
+    return platform.processor() or platform.machine()
+
+
+def describe_data(dataset: str, dataset_kwargs: dict[str, Any], recorded_from: str | None = None) -> dict[str, Any]:
+    """
+    What a dataset was recorded from, and how good that was: the scale of normalised scores.
+
+    :param dataset: Minari id or robomimic file
+    :param dataset_kwargs: of :func:`~sb3_dtfm.data.load_dataset`
+    :param recorded_from: the agent or demonstrator, read from the dataset's metadata if not given
+    :return: dataset (a file without its folder), recorded_from, n_episodes, n_steps, and mean_return of the episodes
+    :raises DatasetError: it cannot be read
+    """
+    buffer = load_dataset(dataset, **dataset_kwargs)
+    in_file = Path(dataset).expanduser().is_file()
+    return {
+        "dataset": Path(dataset).name if in_file else dataset,
+        "recorded_from": recorded_from or (_robomimic_source(dataset) if in_file else _minari_source(dataset)),
+        "n_episodes": buffer.n_episodes,
+        "n_steps": len(buffer),
+        "mean_return": round(float(np.mean(buffer.episode_returns)), 4),
+    }
+
+
+def _minari_source(dataset_id: str) -> str:
+    stored = minari.load_dataset(dataset_id).storage.metadata
+    return ": ".join(str(stored[key]) for key in ("algorithm_name", "description") if stored.get(key)) or "not named"
+
+
+def _robomimic_source(path: str) -> str:
+    """The task; such files do not say who demonstrated."""
+    with h5py.File(Path(path).expanduser()) as file:
+        env_args = json.loads(file["data"].attrs.get("env_args", "{}"))  # the reader has checked it
+    version = env_args.get("env_version")
+    return f"demonstrations of {env_args.get('env_name', 'a task not named')}" + (
+        f", robosuite {version}" if version else ""
+    )

@@ -1,0 +1,198 @@
+"""From rows to runs: what each training run achieved, and how runs of a cell are summed up."""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_dtfm.benchmark.rows import Cell, Row
+from sb3_dtfm.benchmark.statistics import Interval, mean_and_deviation, student_t, wilson
+
+ALGORITHMS = {"dt": "DT", "dtfm": "DTFM"}
+PAPER_REGIMES = (1.0, 0.5)
+N_LATE = 5  # evaluations in the late average
+MEASURES = {"late": "late average", "best": "best evaluation", "final": "final evaluation"}
+
+
+class Run(NamedTuple):
+    """
+    One training run.
+
+    :param cell: what it is known by
+    :param evaluations: rows of the evaluations during training, by gradient step
+    :param final: row of the final evaluation
+    """
+
+    cell: Cell
+    evaluations: list[Row]
+    final: Row
+
+    @property
+    def counts_success(self) -> bool:
+        """Whether its task reports success; the mean return measures it otherwise."""
+        return self.final["successes"] is not None
+
+    def value(self, measure: str) -> float | None:
+        """
+        Success in percent, or mean return in reward units.
+
+        :param measure: "late", "best" or "final"
+        :return: None where there was no evaluation during training
+        """
+        if measure == "final":
+            return row_value(self.final)
+        values = [row_value(row) for row in self.evaluations]
+        if not values:
+            return None
+        return max(values) if measure == "best" else float(np.mean(values[-N_LATE:]))
+
+    def score(self, measure: str) -> float | None:
+        """
+        The value on a scale common to tasks: success rate, or share of the recorded episodes' mean return.
+
+        :return: None where the recorded return is not positive or not known, or the value is not
+        """
+        value, scale = self.value(measure), 100.0 if self.counts_success else self.final["data"].get("mean_return")
+        if value is None or not isinstance(scale, float | int) or scale <= 0:
+            return None
+        return value / scale
+
+    @property
+    def minutes(self) -> float:
+        """Training time without evaluations."""
+        return self.final["wall_s"] / 60
+
+
+class Curve(NamedTuple):
+    """Gradient steps (E,), the mean over runs (E,) and the limits of its 95 % band (E,)."""
+
+    steps: np.ndarray
+    mean: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+class Group(NamedTuple):
+    """
+    All runs of one profile and label: one table, one figure.
+
+    :param profile: name of the settings
+    :param label: name of what else was changed
+    :param tasks: those that the table shows, run or not
+    :param runs: by task, regime and algorithm, in the order of seeds
+    """
+
+    profile: str
+    label: str
+    tasks: list[str]
+    runs: dict[tuple[str, float, str], list[Run]]
+
+    @property
+    def title(self) -> str:
+        """Heading."""
+        return f"{self.profile}, {self.label}" if self.label else self.profile
+
+    @property
+    def regimes(self) -> list[float]:
+        """Shares of the data, the paper's and those run, largest first."""
+        return sorted({*PAPER_REGIMES, *(regime for _, regime, _ in self.runs)}, reverse=True)
+
+    def of(self, task: str, regime: float, algo: str) -> list[Run]:
+        """Runs of one cell, none if it was not run."""
+        return self.runs.get((task, regime, algo), [])
+
+    def of_task(self, task: str) -> list[Run]:
+        """All runs on one task."""
+        return [run for (each, _, _), runs in self.runs.items() if each == task for run in runs]
+
+
+def row_value(row: Row) -> float:
+    """Success in percent where the task reports it, else the mean return."""
+    return 100.0 * float(np.mean(row["successes"])) if row["successes"] is not None else float(np.mean(row["returns"]))
+
+
+def group_runs(rows: Iterable[Row], tasks: Sequence[str] = ()) -> tuple[list[Group], list[Cell]]:
+    """
+    Runs by profile and label.
+
+    :param rows: in any order
+    :param tasks: shown first and in this order; run or not, where there is no label
+    :return: the groups, and cells left out because they have no final evaluation
+    """
+    evaluations: dict[Cell, list[Row]] = {}
+    finals: dict[Cell, Row] = {}
+    for row in sorted(rows, key=lambda row: int(row["step"])):
+        cell = Cell.of(row)
+        evaluations.setdefault(cell, [])
+        if row["final"]:
+            finals[cell] = row
+        else:
+            evaluations[cell].append(row)
+    groups: dict[tuple[str, str], Group] = {}
+    for cell in sorted(finals):
+        group = groups.setdefault((cell.profile, cell.label), Group(cell.profile, cell.label, [], {}))
+        if cell.task not in group.tasks:
+            group.tasks.append(cell.task)
+        group.runs.setdefault((cell.task, cell.regime, cell.algo), []).append(Run(cell, evaluations[cell], finals[cell]))
+    for group in groups.values():
+        # What was changed for a label may not be meant for all tasks.
+        first = [task for task in tasks if task in group.tasks] if group.label else tasks
+        group.tasks[:] = dict.fromkeys([*first, *group.tasks])
+    return [groups[key] for key in sorted(groups)], sorted(set(evaluations) - set(finals))
+
+
+def spread(runs: Sequence[Run], measure: str) -> tuple[float, float] | None:
+    """Mean and standard deviation of a measure over runs; None where it was not taken."""
+    values = [value for run in runs if (value := run.value(measure)) is not None]
+    return mean_and_deviation(values) if values else None
+
+
+def final_interval(runs: Sequence[Run]) -> Interval:
+    """Final evaluation: success in percent with Wilson's interval of all episodes, or return with Student's over runs."""
+    if all(run.counts_success for run in runs):
+        return _pooled_success([run.final for run in runs])
+    return student_t([row_value(run.final) for run in runs])
+
+
+def _pooled_success(rows: Sequence[Row]) -> Interval:
+    successes = np.concatenate([row["successes"] for row in rows])
+    return Interval(*(100.0 * limit for limit in wilson(int(successes.sum()), len(successes))))
+
+
+def learning_curve(runs: Sequence[Run]) -> Curve:
+    """
+    Mean over runs at each gradient step at which all of them were evaluated.
+
+    The band is :func:`final_interval`'s at each step; that of a single run's returns is over its episodes.
+    """
+    by_step = [{row["step"]: row for row in run.evaluations} for run in runs]
+    steps = sorted(set.intersection(*(set(rows) for rows in by_step)))
+    points = []
+    for step in steps:
+        rows = [each[step] for each in by_step]
+        mean = float(np.mean([row_value(row) for row in rows]))
+        if all(row["successes"] is not None for row in rows):
+            interval = _pooled_success(rows)
+        else:
+            interval = student_t([row_value(row) for row in rows] if len(rows) > 1 else rows[0]["returns"])
+        points.append((mean, interval.low, interval.high))
+    mean, low, high = np.array(points, float).reshape(-1, 3).T
+    return Curve(np.array(steps, int), mean, low, high)
+
+
+def paired_scores(group: Group, measure: str) -> tuple[list[tuple[str, float]], list[np.ndarray], list[np.ndarray]]:
+    """
+    Scores of the cells that both algorithms have run.
+
+    :return: task and regime of each, and the runs' scores of DT and of DTFM
+    """
+    keys: list[tuple[str, float]] = []
+    scores: dict[str, list[np.ndarray]] = {algo: [] for algo in ALGORITHMS}
+    for task in group.tasks:
+        for regime in group.regimes:
+            found = {algo: [run.score(measure) for run in group.of(task, regime, algo)] for algo in ALGORITHMS}
+            if all(values and None not in values for values in found.values()):
+                keys.append((task, regime))
+                for algo, values in found.items():
+                    scores[algo].append(np.array(values, float))
+    return keys, scores["dt"], scores["dtfm"]

@@ -1,0 +1,248 @@
+"""The grid: what it asks for, and a tiny real one that is killed and goes on."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+from filelock import FileLock
+
+from sb3_dtfm.benchmark import runner
+from sb3_dtfm.benchmark.display import PlainDisplay
+from sb3_dtfm.benchmark.grid import parse_arguments, plan, read_tasks
+from sb3_dtfm.benchmark.rows import read_rows
+from sb3_dtfm.benchmark.settings import Task, task_settings
+from sb3_dtfm.zoo.arguments import UsageError
+from sb3_dtfm.zoo.cli import main
+from tests.zoo.conftest import DATASET_ID
+
+TASK = "HalfCheetah-v5"
+POLICY = dict(embed_dim=16, n_layers=1, n_heads=1, flow_hidden_dim=16, flow_n_layers=1, n_solver_steps=2)
+SETTINGS = dict(policy="MultiInputPolicy", n_timesteps=6, batch_size=4, context_length=3, policy_kwargs=POLICY)
+STEPS = [(2, False), (4, False), (6, False), (6, True)]
+PATIENCE = 120  # seconds to wait for a cell
+
+
+@pytest.fixture
+def grid(workplace) -> list[str]:
+    """Arguments of a grid of 2 regimes and 2 algorithms, episodes of 10 steps."""
+    (workplace / "tiny.yml").write_text(yaml.safe_dump({"default": SETTINGS}))
+    arguments = ["benchmark", "--profile", "tiny.yml", "--dataset", f"{TASK}={DATASET_ID}", "--target-return", "50"]
+    arguments += ["--eval-freq", "2", "--eval-episodes", "2", "--final-episodes", "3", "--n-eval-envs", "2"]
+    return [*arguments, "--env-kwargs", "max_episode_steps:10"]
+
+
+def start(arguments: list[str]) -> subprocess.Popen[bytes]:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen([sys.executable, "-m", "sb3_dtfm", *arguments], env=environment, stdout=subprocess.DEVNULL)
+
+
+def test_a_killed_grid_goes_on_and_repeats_nothing(grid, workplace, capfd, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    process = start(grid)
+    results = workplace / "results"
+    deadline = time.monotonic() + PATIENCE
+    while not list(results.glob("*.jsonl")) and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    (first,) = results.glob("*.jsonl")
+    content, written = first.read_bytes(), first.stat().st_mtime_ns
+    # What a cell that was killed halfway leaves behind
+    broken = workplace / "logs" / "benchmark" / f"{TASK}_0.5_dtfm_seed0_tiny" / "attempt-old"
+    broken.mkdir(parents=True)
+    (broken / "rows.jsonl").write_text(content.decode().splitlines()[0] + "\n")
+
+    assert main(grid) == 0
+    output = capfd.readouterr().out
+    assert "3 cells to run, 1 finished already in results" in output
+    assert "[3/3]" in output
+    assert (first.read_bytes(), first.stat().st_mtime_ns) == (content, written)
+    assert not broken.exists()
+    rows = {path.name: read_rows(path) for path in results.glob("*.jsonl")}
+    assert {(row["algo"], row["regime"]) for each in rows.values() for row in each} == {
+        ("dt", 1.0), ("dt", 0.5), ("dtfm", 1.0), ("dtfm", 0.5),
+    }  # fmt: skip
+    for each in rows.values():
+        assert [(row["step"], row["final"]) for row in each] == STEPS
+        assert [len(row["returns"]) for row in each] == [2, 2, 2, 3]
+        assert {length for row in each for length in row["lengths"]} == {10}
+        assert all(row["successes"] is None for row in each)
+        assert {row["data"]["dataset"] for row in each} == {DATASET_ID}
+        assert {row["data"]["n_episodes"] for row in each} == {3}
+        assert each[0]["data"]["recorded_from"].startswith("PPO: ")
+        assert (each[0]["solver"], each[0]["n_solver_steps"]) == (
+            ("euler", 2) if each[0]["algo"] == "dtfm" else (None, None)
+        )
+
+    assert main(grid) == 0
+    assert "0 cells to run, 4 finished already" in capfd.readouterr().out
+    assert main(["report", "results", "-o", "docs"]) == 0
+    assert "not run" not in (workplace / "docs" / "report.md").read_text().split("Aggregates")[0]
+    assert main([*grid, "-n", "8"]) == 2
+    assert "results has it with 6 gradient steps, 8 are asked for" in capfd.readouterr().err
+
+
+STUB = """
+import json, pathlib, sys, time
+spec = pathlib.Path(sys.argv[1])
+row = json.loads(spec.read_text())["row"]
+(spec.parent / "progress.json").write_text(json.dumps([3, 6, "training"]))
+if row["algo"] == "dtfm":
+    {instead}
+evaluation = dict(step=6, final=True, returns=[1.0], lengths=[2], successes=None, solver=None, n_solver_steps=None)
+rest = dict(wall_s=1.0, steps_per_s=6.0, commit=None, versions={{}}, hardware={{}})
+(spec.parent / "rows.jsonl").write_text(json.dumps({{**row, **evaluation, **rest}}) + chr(10))
+"""
+
+
+@pytest.fixture
+def stub(workplace, monkeypatch):
+    """Cells that do nothing; `dtfm` does what is asked."""
+
+    def use(instead: str) -> None:
+        (workplace / "stub.py").write_text(STUB.format(instead=instead))
+
+    monkeypatch.setattr(runner, "CELL_MODULE", "stub")
+    return use
+
+
+@pytest.mark.parametrize(
+    ("instead", "says"),
+    [("raise ValueError('in the midst')", "ValueError: in the midst"), ("sys.exit()", "nothing was written")],
+)
+def test_a_cell_that_fails_leaves_a_log_and_the_grid_goes_on(instead, says, grid, stub, workplace, capfd):
+    stub(instead)
+    grid += ["--jobs", "2", "--algo", "dtfm", "dt", "--fractions", "1"]
+    with pytest.raises(SystemExit) as exit_:
+        main(grid)
+    assert exit_.value.code == 1
+    (log,) = (workplace / "logs" / "benchmark" / f"{TASK}_1_dtfm_seed0_tiny").glob("*/output.log")
+    output = capfd.readouterr().out
+    assert "1 of 2 cells failed" in output
+    assert f"{log.relative_to(workplace)}: {says}" in output
+    assert [path.name for path in (workplace / "results").glob("*.jsonl")] == [f"{TASK}_1_dt_seed0_tiny.jsonl"]
+
+    stub("pass")
+    assert main(grid) == 0
+    assert "1 cells to run, 1 finished already" in capfd.readouterr().out
+
+
+def test_an_interrupted_grid_ends_its_cells_and_says_so(grid, stub, workplace, monkeypatch, capfd):
+    stub("time.sleep(600)")
+    started = []
+    popen = subprocess.Popen
+    monkeypatch.setattr(
+        runner.subprocess, "Popen", lambda *args, **kwargs: started.append(popen(*args, **kwargs)) or started[-1]
+    )
+
+    def interrupt(*_) -> None:
+        if list(workplace.glob("logs/benchmark/*dtfm*/*/progress.json")):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(PlainDisplay, "update", interrupt)
+    with pytest.raises(SystemExit) as exit_:
+        main([*grid, "--fractions", "1"])
+    assert exit_.value.code == 130
+    assert "Interrupted after 1 of 2 cells" in capfd.readouterr().out
+    assert [process.returncode for process in started] == [0, -signal.SIGTERM]
+    assert len(list((workplace / "results").glob("*.jsonl"))) == 1
+
+
+def test_a_cell_that_another_process_runs_is_left_to_it(grid, stub, workplace, capfd):
+    stub("pass")
+    locks = workplace / "results" / ".locks"
+    locks.mkdir(parents=True)
+    with FileLock(locks / f"{TASK}_1_dt_seed0_tiny.lock"), pytest.raises(SystemExit) as exit_:
+        main([*grid, "--fractions", "1"])
+    assert exit_.value.code == 1
+    output = capfd.readouterr().out
+    assert f"{TASK}, 100% of the data, dt, seed 0, tiny: another process is running it" in output
+    assert "0 of 2 cells failed, 1 are left to other processes" in output
+    assert [path.name for path in (workplace / "results").glob("*.jsonl")] == [f"{TASK}_1_dtfm_seed0_tiny.jsonl"]
+
+
+@pytest.mark.parametrize("profile", ["small", "paper"])
+@pytest.mark.parametrize("env_id", [TASK, "Ant-v5", "robosuite/Lift-v0"])
+def test_the_packaged_profiles_differ_in_the_head_only(profile, env_id):
+    dt, dtfm = (task_settings(profile, algo, Task(env_id), 0.5, None, {}) for algo in ("dt", "dtfm"))
+    own = {"flow_hidden_dim", "flow_n_layers", "solver", "n_solver_steps"}
+    assert set(dtfm["policy_kwargs"]) - set(dt["policy_kwargs"]) == own
+    dtfm["policy_kwargs"] = {key: value for key, value in dtfm["policy_kwargs"].items() if key not in own}
+    assert dt == dtfm
+    assert (dt["dataset_fraction"], dt["dataset_seed"]) == (0.5, 0)
+
+
+def test_policy_kwargs_of_params_are_merged_and_heads_left_to_their_algorithm():
+    changes = {"policy_kwargs": {"n_solver_steps": 3, "dropout": 0.0}, "regression_coef": 0.1, "ema_decay": 0.9}
+    dt, dtfm = (task_settings("small", algo, Task(TASK), 1.0, 7, changes) for algo in ("dt", "dtfm"))
+    assert dtfm["policy_kwargs"]["n_solver_steps"] == 3
+    assert dtfm["policy_kwargs"]["embed_dim"] == 128
+    assert dtfm["regression_coef"] == 0.1
+    assert (dt["policy_kwargs"]["dropout"], dt["ema_decay"], dt["n_timesteps"]) == (0.0, 0.9, 7)
+    assert "regression_coef" not in dt
+    assert "n_solver_steps" not in dt["policy_kwargs"]
+
+
+def test_tasks_come_from_a_file_or_from_pairs(tmp_path):
+    file = tmp_path / "data.yml"
+    entry = {"dataset": "local/ant/expert-v0", "target_return": 5000, "recorded_from": "PPO"}
+    file.write_text(yaml.safe_dump({"robosuite/Lift-v0": "lift.hdf5", "Ant-v5": entry}, sort_keys=False))
+    more = ["--dataset", "robosuite/Lift-v0=other.hdf5", "--target-return", "Ant-v5=6000"]
+    tasks = read_tasks(parse_arguments(["--datasets", str(file), *more]))
+    assert tasks == [Task("robosuite/Lift-v0", "other.hdf5"), Task("Ant-v5", "local/ant/expert-v0", 6000.0, "PPO")]
+    assert read_tasks(parse_arguments(["--env", TASK, "--target-return", "9"])) == [Task(TASK, None, 9.0)]
+
+
+def test_the_first_seed_of_everything_comes_first(grid, monkeypatch):
+    options = parse_arguments([*grid[1:], "--seeds", "0", "1"])
+    jobs, done = plan(options)
+    assert [(job.cell.seed, job.cell.regime, job.cell.algo) for job in jobs] == [
+        (seed, regime, algo) for seed in (0, 1) for regime in (1.0, 0.5) for algo in ("dt", "dtfm")
+    ]
+    assert {json.dumps(job.data) for job in jobs} == {json.dumps(jobs[0].data)}
+    assert done == []
+
+
+def test_algorithms_with_different_trunks_are_refused(grid, workplace):
+    folder = workplace / "profile"
+    folder.mkdir()
+    for algo, width in (("dt", 16), ("dtfm", 32)):
+        (folder / f"{algo}.yml").write_text(
+            yaml.safe_dump({"default": {**SETTINGS, "policy_kwargs": {**POLICY, "embed_dim": width}}})
+        )
+    with pytest.raises(UsageError, match="embed_dim of HalfCheetah-v5 is 16 for dt and 32 for dtfm"):
+        plan(parse_arguments([*grid[1:], "--profile", "profile"]))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--env", "HalfCheeta-v5"], "HalfCheeta-v5: no such task, did you mean HalfCheetah-v5?"),
+        ([], "no task: name some with --env"),
+        (["--dataset", TASK], f"--dataset {TASK}: expected TASK=DATASET"),
+        (["--dataset", f"{TASK}=nowhere.hdf5"], "nowhere.hdf5 does not exist"),
+        (["--env", "Hopper-v5"], "--dataset, --target-return: needed for Hopper-v5"),
+        (["--env", TASK, "--profile", "nowhere.yml"], "--profile nowhere.yml: nowhere.yml does not exist"),
+        (["--env", TASK, "--fractions", "2"], "--fractions: must lie in (0, 1], got 2.0"),
+        (["--env", TASK, "--jobs", "0"], "--jobs: must be at least 1, got 0"),
+        (["--env", TASK, "-params", "ema_decay:0.9"], "-params: needs --label"),
+        (["--env", TASK, "--label", "a", "-params", "dataset_seed:1"], "dataset_seed: the grid sets it"),
+        (["--env", TASK, "--label", "a", "-params", "ema:1"], "ema: no setting of dt"),
+        (["--env", TASK, "--label", "a", "-params", "ema_decay"], "-params ema_decay: expected key:value"),
+        (["--env", TASK, "--label", "a", "-params", "precision:object()"], "a setting that YAML cannot hold"),
+        (["--env", TASK, "--target-return", "much"], "--target-return much: expected a number, got 'much'"),
+    ],
+)
+def test_a_mistake_ends_in_one_clear_line_before_anything_runs(arguments, message, workplace, capsys):
+    assert main(["benchmark", *arguments]) == 2
+    error = capsys.readouterr().err.strip().splitlines()
+    assert len(error) == 1
+    assert message in error[0]
+    assert not Path("results").exists()
+    assert not Path("logs").exists()

@@ -1,0 +1,77 @@
+"""Where rows come from."""
+
+import json
+import re
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_dtfm.benchmark import provenance
+from sb3_dtfm.data import DatasetError
+from tests.zoo.conftest import DATASET_ID
+
+
+def write_demonstrations(path: Path, env_args: str | None) -> None:
+    """Two demonstrations of three steps that succeed at the end."""
+    with h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        if env_args is not None:
+            data.attrs["env_args"] = env_args
+        for i in range(2):
+            demo = data.create_group(f"demo_{i}")
+            demo["actions"] = np.zeros((3, 7))
+            demo["rewards"] = np.array([0.0, 0.0, 1.0])
+            demo["dones"] = np.array([0, 0, 1])
+            for key, width in (("robot0_eef_pos", 3), ("robot0_eef_quat", 4), ("robot0_gripper_qpos", 2), ("object", 10)):
+                demo[f"obs/{key}"] = np.random.default_rng(i).normal(size=(3, width))
+
+
+def test_the_commit_is_that_of_the_sources_or_none():
+    commit = provenance.commit()
+    assert commit is None or re.fullmatch(r"[0-9a-f]{40}(-dirty)?", commit)
+
+
+def test_sources_outside_of_git_have_no_commit(tmp_path, monkeypatch):
+    monkeypatch.setattr(provenance.sb3_dtfm, "__file__", str(tmp_path / "__init__.py"))
+    assert provenance.commit() is None
+    monkeypatch.setenv("PATH", "")
+    assert provenance.commit() is None, "without git"
+
+
+def test_versions_and_hardware_fit_into_json():
+    text = json.dumps([provenance.versions(), provenance.hardware(th.device("cpu"))])
+    versions, hardware = json.loads(text)
+    assert {"python", "torch", "stable-baselines3", "sb3-dtfm"} <= set(versions)
+    assert hardware["gpu"] is None
+    assert hardware["cores"] >= 1
+
+
+def test_a_minari_dataset_names_its_agent(workplace):
+    data = provenance.describe_data(DATASET_ID, {})
+    assert (data["dataset"], data["n_episodes"]) == (DATASET_ID, 3)
+    assert data["recorded_from"].startswith("PPO: re-recorded from agent.zip: 3 episodes")
+    assert data["n_steps"] == 3000
+    assert provenance.describe_data(DATASET_ID, {}, "an agent")["recorded_from"] == "an agent"
+
+
+@pytest.mark.parametrize(
+    ("env_args", "source"),
+    [
+        (json.dumps({"env_name": "Lift", "env_version": "1.5.2"}), "demonstrations of Lift, robosuite 1.5.2"),
+        (json.dumps({"env_name": "Lift"}), "demonstrations of Lift"),
+        (None, "demonstrations of a task not named"),
+    ],
+)
+def test_a_robomimic_file_names_its_task_and_not_its_folder(env_args, source, tmp_path):
+    write_demonstrations(tmp_path / "lift.hdf5", env_args)
+    assert provenance.describe_data(str(tmp_path / "lift.hdf5"), {}) == {
+        "dataset": "lift.hdf5", "recorded_from": source, "n_episodes": 2, "n_steps": 6, "mean_return": 1.0,
+    }  # fmt: skip
+
+
+def test_a_dataset_that_cannot_be_read_is_refused(tmp_path):
+    with pytest.raises(DatasetError, match=r"nothing\.hdf5"):
+        provenance.describe_data(str(tmp_path / "nothing.hdf5"), {})

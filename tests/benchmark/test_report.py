@@ -1,0 +1,121 @@
+"""The report on small committed rows, whose numbers can be worked out by hand."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sb3_dtfm.benchmark.rows import Cell, merge_rows, result_files
+from sb3_dtfm.benchmark.runs import group_runs, learning_curve, paired_scores, spread
+from sb3_dtfm.zoo.cli import main
+
+ROWS = Path(__file__).parent / "rows"
+LIFT, CHEETAH = "robosuite/Lift-v0", "HalfCheetah-v5"
+
+
+@pytest.fixture(scope="module")
+def groups():
+    found, _ = group_runs(merge_rows(result_files([ROWS])), [LIFT])
+    return {group.title: group for group in found}
+
+
+def table_row(text: str, *start: str) -> list[list[str]]:
+    """Cells of all table lines that begin like this."""
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")]
+    return [line[len(start) :] for line in lines if line[: len(start)] == list(start)]
+
+
+def test_labels_are_told_apart_and_unfinished_cells_left_out():
+    groups, unfinished = group_runs(merge_rows(result_files([ROWS])))
+    assert [group.title for group in groups] == ["small", "small, ema"]
+    assert unfinished == [Cell(CHEETAH, 1.0, "dt", 0, "small")]
+
+
+def test_late_best_and_final_are_those_of_each_run(groups):
+    runs = groups["small"].of(LIFT, 1.0, "dt")
+    # Of four episodes each: 0 1 2 3 2 2 and 0 2 2 2 4 2 succeed, then 3 at the end.
+    assert [run.value("late") for run in runs] == [50.0, 60.0]
+    assert [run.value("best") for run in runs] == [75.0, 100.0]
+    assert [run.value("final") for run in runs] == [75.0, 75.0]
+    assert spread(runs, "late") == pytest.approx((55.0, math.sqrt(50)))
+    assert groups["small, ema"].of(CHEETAH, 0.5, "dtfm")[0].value("late") is None
+
+
+def test_the_curve_is_the_mean_over_seeds_with_a_pooled_band(groups):
+    curve = learning_curve(groups["small"].of(LIFT, 1.0, "dt"))
+    assert curve.steps.tolist() == [10, 20, 30, 40, 50, 60]
+    assert curve.mean.tolist() == [0.0, 37.5, 50.0, 62.5, 75.0, 50.0]
+    assert (curve.low <= curve.mean).all()
+    assert (curve.high >= curve.mean).all()
+    # Half of 8 succeed: Wilson's interval of 4 in 8
+    assert (curve.low[2], curve.high[2]) == pytest.approx((21.52, 78.48), abs=0.01)
+
+
+def test_scores_are_shares_of_the_recorded_return(groups):
+    keys, dt, dtfm = paired_scores(groups["small"], "final")
+    assert keys == [(LIFT, 1.0), (CHEETAH, 0.5)]
+    assert [scores.tolist() for scores in dt] == [[0.75, 0.75], [0.5]]
+    assert [scores.tolist() for scores in dtfm] == [[1.0, 1.0, 1.0], [0.8]]
+
+
+def test_the_report_shows_what_was_run_and_what_was_not(tmp_path, capsys):
+    assert main(["report", str(ROWS), "-o", str(tmp_path), "--tasks", LIFT, "Ant-v5"]) == 0
+    text = (tmp_path / "report.md").read_text()
+    achieved, interval, pace = table_row(text, LIFT, "100%")
+    assert achieved == ["55.0 ± 7.1", "88.3 ± 10.4", "87.5 ± 17.7", "100.0 ± 0.0", "75.0 ± 0.0", "100.0 ± 0.0", "2 / 3"]
+    assert interval == ["75.0 [40.9, 92.9] % of 8 episodes", "100.0 [75.8, 100.0] % of 12 episodes"]
+    assert pace == ["2.0", "12.5", "37.5", "2.0", "12.5", "50.0"]
+    assert table_row(text, LIFT, "50%")[0] == ["*not run*"] * 6 + ["0 / 0"]
+    assert len(table_row(text, "Ant-v5", "100%")) == 4
+    achieved, interval, scores = table_row(text, CHEETAH, "50%")[:3]
+    assert achieved[:2] == ["3,800", "6,050"]
+    assert interval == ["5,000 (one seed, no interval)", "8,000 (one seed, no interval)"]
+    assert scores == ["10,000 (TQC: sampled actions)", "0.38", "0.60", "0.50", "0.80"]
+    # DTFM wins all 6 pairs on Lift, and the one on HalfCheetah
+    assert table_row(text, "final evaluation")[0][2] == "1.00 [1.00, 1.00]"
+    assert "Left out, as they have no final evaluation: HalfCheetah-v5, 100% of the data, dt, seed 0, small." in text
+    assert "`local/halfcheetah/expert-v0`, 100 episodes, recorded from TQC: sampled actions" in text
+    for name in ("curves-small.png", "curves-small-ema.png"):
+        assert f"]({name})" in text
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_baseline_is_drawn(tmp_path, monkeypatch):
+    from matplotlib.axes import Axes
+
+    labels = []
+    plot = Axes.plot
+    monkeypatch.setattr(
+        Axes, "plot", lambda self, *data, **kwargs: labels.append(kwargs["label"]) or plot(self, *data, **kwargs)
+    )
+    np.savez(tmp_path / "evaluations.npz", timesteps=[500, 1000], results=np.ones((2, 3)))
+    baseline = f"{CHEETAH}:SAC={tmp_path / 'evaluations.npz'}"
+    assert main(["report", str(ROWS), "-o", str(tmp_path), "--baseline", baseline]) == 0
+    assert {"DT", "DTFM", "SAC (1,000 environment steps)"} == set(labels)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere"], "nowhere does not exist"),
+        (["."], "no finished cell"),
+        (["bad.jsonl"], "bad.jsonl, line 1: is not JSON"),
+        ([str(ROWS), "--baseline", "SAC"], "expected NAME=FILE or TASK:NAME=FILE"),
+        ([str(ROWS), "--baseline", "SAC=nowhere.npz"], "nowhere.npz does not exist"),
+        ([str(ROWS), "--baseline", "SAC=a.npz"], "of which task? Write TASK:SAC=FILE"),
+        ([str(ROWS), "--baseline", "Ant-v5:SAC=a.npz"], f"the results hold {CHEETAH}, {LIFT}"),
+        ([str(ROWS), "--baseline", f"{LIFT}:SAC=a.npz"], "holds no successes"),
+        ([str(ROWS), "--baseline", "SAC=b.npz"], "expected timesteps and results"),
+    ],
+)
+def test_a_mistake_ends_in_one_clear_line(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    np.savez("a.npz", timesteps=[500], results=np.ones((1, 3)))
+    np.savez("b.npz", other=[500])
+    if "bad.jsonl" in arguments:
+        Path("bad.jsonl").write_text("{\n")
+    assert main(["report", *arguments]) == 2
+    error = capsys.readouterr().err.strip().splitlines()
+    assert len(error) == 1
+    assert message in error[0]

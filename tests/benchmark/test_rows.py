@@ -1,0 +1,88 @@
+"""Rows: there and back, merged, and refused with file and line."""
+
+import json
+
+import pytest
+
+from sb3_dtfm.benchmark.rows import KEYS, Cell, RowError, finished_cells, merge_rows, read_rows, result_files, write_row
+from tests.benchmark.conftest import make_row
+
+
+def test_a_row_comes_back_as_it_was_written(tmp_path, row):
+    other = make_row(seed=1, successes=None, solver=None, n_solver_steps=None, commit=None)
+    for each in (row, other):
+        write_row(tmp_path / "a.jsonl", each)
+    assert read_rows(tmp_path / "a.jsonl") == [row, other]
+
+
+def test_files_of_several_machines_merge_by_concatenation(tmp_path):
+    rows = [make_row(seed=seed) for seed in range(3)]
+    write_row(tmp_path / "a.jsonl", rows[0])
+    write_row(tmp_path / "b.jsonl", rows[1])
+    write_row(tmp_path / "b.jsonl", rows[2])
+    files = result_files([tmp_path])
+    (tmp_path / "all.jsonl").write_text("".join(file.read_text() for file in files))
+    assert merge_rows(files) == rows
+    assert merge_rows(result_files([tmp_path])) == rows, "a row that is there twice counts once"
+    assert finished_cells(rows) == {Cell.of(row): 10 for row in rows}
+
+
+def test_two_results_of_one_evaluation_are_refused(tmp_path):
+    write_row(tmp_path / "a.jsonl", make_row())
+    write_row(tmp_path / "b.jsonl", make_row(returns=[0.0, 0.0, 0.0, 0.0]))
+    with pytest.raises(RowError, match=r"a\.jsonl and .*b\.jsonl: different results of robosuite/Lift-v0"):
+        merge_rows(result_files([tmp_path]))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"step": "10"}, "step is '10', expected int"),
+        ({"step": True}, "step is True, expected int"),
+        ({"final": 1}, "final is 1, expected bool"),
+        ({"regime": 1.5}, "regime is 1.5, expected a number in"),
+        ({"lengths": [1]}, "4 returns, 1 lengths, 4 successes"),
+        ({"returns": [], "lengths": [], "successes": []}, "0 returns"),
+        ({"returns": [1.0, "x", 1.0, 1.0]}, "returns holds 'x'"),
+        ({"successes": [1, 1, 1, 1]}, "successes holds 1, expected bool"),
+        ({"speed": 3}, "unknown speed"),
+    ],
+)
+def test_a_malformed_row_is_named_by_file_and_line(tmp_path, changes, message, row):
+    path = tmp_path / "a.jsonl"
+    path.write_text(f"{json.dumps(row)}\n\n{json.dumps({**row, **changes})}\n")
+    with pytest.raises(RowError, match=r"a\.jsonl, line 3: ") as error:
+        read_rows(path)
+    assert message in str(error.value)
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_every_key_is_needed(tmp_path, key, row):
+    del row[key]
+    (tmp_path / "a.jsonl").write_text(json.dumps(row))
+    with pytest.raises(RowError, match=f"line 1: lacks {key}; expected are task,"):
+        read_rows(tmp_path / "a.jsonl")
+
+
+@pytest.mark.parametrize("text", ['{"task": ', "[1]"])
+def test_what_is_no_object_is_refused(tmp_path, text):
+    (tmp_path / "a.jsonl").write_text(text)
+    with pytest.raises(RowError, match=r"a\.jsonl, line 1: "):
+        read_rows(tmp_path / "a.jsonl")
+
+
+def test_what_json_cannot_hold_is_not_written(tmp_path):
+    with pytest.raises(ValueError, match="JSON"):
+        write_row(tmp_path / "a.jsonl", make_row(returns=[float("nan")] * 4))
+
+
+def test_a_cells_file_name_has_no_separators():
+    cell = Cell("robosuite/Lift-v0", 0.5, "dt", 2, "small", "no ema")
+    assert cell.file_name == "robosuite-Lift-v0_0.5_dt_seed2_small_no-ema"
+    assert str(cell) == "robosuite/Lift-v0, 50% of the data, dt, seed 2, small, no ema"
+
+
+def test_nan_in_a_file_is_refused(tmp_path, row):
+    (tmp_path / "a.jsonl").write_text(json.dumps({**row, "wall_s": float("nan")}))
+    with pytest.raises(RowError, match=r"line 1: holds NaN"):
+        read_rows(tmp_path / "a.jsonl")
