@@ -133,6 +133,8 @@ def main() -> None:
         with ProcessPoolExecutor(max(1, (os.cpu_count() or 2) - 1), spawn) as pool:
             elsewhere = EvaluateElsewhere(options.folder, options.evaluation_interval, pool, options)
             model.learn(options.steps, elsewhere, progress_bar=True)
+            for future in elsewhere.futures:
+                future.result()  # an evaluation that failed raises here
             print(f"{options.steps} steps in {(time.perf_counter() - start) / 60:.1f} minutes")
         model.save(options.folder / "final.zip")
 

@@ -182,10 +182,30 @@ def test_a_state_of_other_environments_is_refused(model):
 
 
 def test_a_cache_gives_the_same_actions_until_the_window_slides(model):
-    exact = roll_plain(model, 5)
+    exact = roll_plain(model, 12)
     model.policy.kv_cache = True
-    assert np.allclose(roll_plain(model, 5), exact, atol=1e-4)
+    cached = roll_plain(model, 12)
+    assert np.allclose(cached[:5], exact[:5], atol=1e-4)
+    assert not np.allclose(cached[5:], exact[5:], atol=1e-4)
     assert np.array_equal(roll_plain(model, 45), roll_with_state(model, 45))
+
+
+def test_a_call_that_fails_leaves_the_cache_as_it_was(model, monkeypatch):
+    model.policy.kv_cache = True
+    observation, _ = make_env().reset(seed=0)
+    _, state = model.predict(observation, deterministic=True)
+    following = {**observation, "timestep": np.array([1])}
+
+    def fail(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(model.policy.acting_network.trunk, "extend", fail)
+        with pytest.raises(KeyboardInterrupt):
+            model.predict(following, state=state, deterministic=True)
+    after, _ = model.predict(following, state=state, deterministic=True)
+    copied = tuple(array.copy() for array in state)
+    assert np.array_equal(after, model.predict(following, state=copied, deterministic=True)[0])
 
 
 def test_a_cache_that_starts_in_mid_episode_is_filled_from_the_window(model):

@@ -12,6 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
+from sb3_dtfm.zoo.plots import wilson_interval
+
 CONFIDENCE = 0.95
 N_BOOTSTRAP = 2000
 
@@ -36,11 +38,7 @@ def wilson(n_successes: int, n_episodes: int) -> Interval:
     """
     if not 0 <= n_successes <= n_episodes or n_episodes == 0:
         raise ValueError(f"n_successes must lie in [0, n_episodes] and n_episodes be positive: {n_successes}, {n_episodes}.")
-    z = float(stats.norm.ppf(0.5 + CONFIDENCE / 2))
-    rate, spread = n_successes / n_episodes, z**2 / n_episodes
-    center = (rate + spread / 2) / (1 + spread)
-    half = z / (1 + spread) * math.sqrt(rate * (1 - rate) / n_episodes + spread / (4 * n_episodes))
-    return Interval(rate, max(0.0, center - half), min(1.0, center + half))
+    return Interval(n_successes / n_episodes, *wilson_interval(n_successes, n_episodes))
 
 
 def student_t(values: Sequence[float] | np.ndarray) -> Interval:

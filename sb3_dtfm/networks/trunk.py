@@ -118,6 +118,8 @@ class SequenceTrunk(nn.Module):
             raise ValueError(f"embed_dim must be a multiple of n_heads, got embed_dim={embed_dim} and n_heads={n_heads}.")
         if n_layers < 1:
             raise ValueError(f"n_layers must be at least 1, got {n_layers}.")
+        if not 0.0 <= dropout < 1.0:
+            raise ValueError(f"dropout must lie in [0, 1), got {dropout}.")
         self.embed_dim = embed_dim
         self.n_layers = n_layers
         self.n_heads = n_heads

@@ -30,12 +30,12 @@ class KeysValuesCache:
         """
         n_kept = kept.shape[3]
         if kept is not self._newest or self._end + TOKENS_PER_STEP > self._memory.shape[3]:
+            self._newest = None
             shape = (*kept.shape[:3], n_kept + ROOM * TOKENS_PER_STEP, kept.shape[4])
             self._memory = th.empty(shape, device=device)
             self._memory[:, :, :, :n_kept] = th.from_numpy(kept).to(device)
             self._end = n_kept
-        self._end += TOKENS_PER_STEP
-        return self._memory[:, :, :, self._end - TOKENS_PER_STEP - n_kept : self._end]
+        return self._memory[:, :, :, self._end - n_kept : self._end + TOKENS_PER_STEP]
 
     def keep(self, keys_values: th.Tensor) -> np.ndarray:
         """
@@ -44,5 +44,6 @@ class KeysValuesCache:
         :param keys_values: (B, layers, 2, L + 3, D)
         :return: (B, layers, 2, L, D), without the oldest step
         """
+        self._end += TOKENS_PER_STEP  # only now: a call that failed on the way has left all as it was
         self._newest = keys_values[:, :, :, TOKENS_PER_STEP:].cpu().numpy()
         return self._newest

@@ -63,7 +63,7 @@ class SequencePolicy(BasePolicy):
     :param dropout: dropout probability of the trunk
     :param weight_decay: AdamW's, on weight matrices only
     :param ema: keep an exponential moving average of the weights and act with it
-    :param kv_cache: act on the keys and values kept of earlier steps instead of recomputing the window: several times
+    :param kv_cache: act on the keys and values kept of earlier steps instead of recomputing the window: two to three times
         faster, and equal until the window slides (see :meth:`SequenceTrunk.extend`); can be set at any time
     :param seed: seed of the noise that acting starts from
     """
@@ -352,8 +352,9 @@ class SequencePolicy(BasePolicy):
         return th.tensor(list(json.dumps(self._acting_settings()).encode()), dtype=th.uint8)
 
     def set_extra_state(self, state: th.Tensor) -> None:
-        for name, value in json.loads(bytes(state.tolist())).items():
-            setattr(self, name, value)
+        settings = json.loads(bytes(state.tolist()))
+        for name in self._acting_settings():
+            setattr(self, name, settings[name])
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         names = (

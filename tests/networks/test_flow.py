@@ -92,12 +92,17 @@ def test_a_flow_head_learns_two_modes_that_regression_would_average():
         actions = th.where(th.rand(256, 1, 1, generator=generator) < 0.5, -0.7, 0.7)
         noise, tau = th.randn(256, 1, 1, generator=generator), th.rand(256, 1, generator=generator)
         optimizer.zero_grad()
-        head.loss(hidden, actions, mask, noise, tau).backward()
+        (head.loss(hidden, actions, mask, noise, tau) + head.one_step_loss(hidden, mask, noise)).backward()
         optimizer.step()
     with th.no_grad():
         samples = head(th.zeros(500, 4), th.randn(500, 1, generator=generator), n_solver_steps=20)
+        noise = th.randn(500, 1, generator=generator)
+        ends, jumps, plain = (head(th.zeros(500, 4), noise, *way) for way in (("euler", 16), ("one_step", 1), ("euler", 1)))
     assert ((samples.abs() - 0.7).abs() < 0.2).float().mean() > 0.9
     assert 0.35 < (samples > 0).float().mean() < 0.65
+    far = noise.abs() > 0.3  # between the modes the flow is steep
+    assert (jumps - ends)[far].abs().mean() < 0.1
+    assert (plain - ends)[far].abs().mean() > 0.4
 
 
 @pytest.mark.parametrize(("solver", "n_solver_steps"), [("verlet", 10), ("euler", 0)])

@@ -89,6 +89,12 @@ def test_regression_actions_stay_within_their_bounds():
     assert RegressionHead(4, 2)(1e3 * th.randn(10, 4)).abs().max() <= 1.0
 
 
+@pytest.mark.parametrize("dropout", [-0.1, 1.0, 1.5])
+def test_dropout_must_be_a_probability_below_one(dropout):
+    with pytest.raises(ValueError, match=f"dropout must lie in .*{dropout}"):
+        SequenceTrunk(OBSERVATION_DIM, A, 10, embed_dim=16, dropout=dropout)
+
+
 def test_width_must_be_a_multiple_of_the_heads():
     with pytest.raises(ValueError, match="embed_dim=30 and n_heads=4"):
         SequenceTrunk(OBSERVATION_DIM, A, 10, embed_dim=30, n_heads=4)
