@@ -1,5 +1,5 @@
 """
-The ways of acting of one trained DTFM on the same initial states: success, return, and time of an action.
+The ways of acting of one trained DTFM on the same initial states: success and return.
 
     python benchmarks/samplers.py logs/dtfm/robosuite-Can-v0_1/robosuite-Can-v0.zip --env robosuite/Can-v0 --target-return 1
 
@@ -8,18 +8,16 @@ Prints one line of JSON for each way; `--report FILES` adds up such lines over m
 
 import argparse
 import json
-import statistics
-import time
 from collections import defaultdict
 from pathlib import Path
-from typing import Any
 
+import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv
 from tqdm import tqdm
 
 from sb3_dtfm import DTFM
+from sb3_dtfm.benchmark.evaluation import SeededEpisodes, evaluate
 from sb3_dtfm.envs import ReturnToGoWrapper
 from sb3_dtfm.zoo.plots import wilson_interval
 
@@ -34,46 +32,23 @@ WAYS = {
 }
 
 
-def roll_out(model: DTFM, vec_env: VecEnv, n_episodes: int, seed: int) -> dict[str, list[float]]:
-    """
-    The first episodes of each environment, the same number in all: episodes that end early are not counted more often.
-
-    :return: returns and successes by episode, and seconds by call of `predict`
-    """
-    per_env = -(-n_episodes // vec_env.num_envs)
-    vec_env.seed(seed)
-    observations, state, starts = vec_env.reset(), None, np.ones(vec_env.num_envs, bool)
-    returns, counts = np.zeros(vec_env.num_envs), np.zeros(vec_env.num_envs, int)
-    result: dict[str, list[float]] = {"returns": [], "successes": [], "seconds": []}
-    with tqdm(total=per_env * vec_env.num_envs, unit="episode", leave=False) as progress:
-        while (counts < per_env).any():
-            start = time.perf_counter()
-            actions, state = model.predict(observations, state, starts, deterministic=True)
-            result["seconds"].append(time.perf_counter() - start)
-            observations, rewards, starts, infos = vec_env.step(actions)
-            returns += rewards
-            for i in np.flatnonzero(starts & (counts < per_env)):
-                result["returns"].append(float(returns[i]))
-                result["successes"].append(float(infos[i].get("is_success", np.nan)))
-                counts[i] += 1
-                progress.update()
-            returns[starts] = 0.0
-    return result
+def make_env(env_id: str, target_return: float) -> gym.Env:
+    """An environment whose episodes start from seeds that are set."""
+    return SeededEpisodes(ReturnToGoWrapper(gym.make(env_id), target_return))
 
 
-def evaluate(options: argparse.Namespace) -> None:
-    wrapper_kwargs = dict(target_return=options.target_return)
-    vec_env = make_vec_env(options.env, options.n_envs, wrapper_class=ReturnToGoWrapper, wrapper_kwargs=wrapper_kwargs)
+def evaluate_ways(options: argparse.Namespace) -> None:
+    """One line of JSON for each way of acting, on the same initial states."""
+    vec_env = DummyVecEnv([lambda: make_env(options.env, options.target_return)] * options.n_envs)
     model = DTFM.load(options.model, device="cpu")
+    seeds = range(options.seed, options.seed + options.episodes)
     for way in options.ways:
         solver, n_solver_steps, kv_cache = WAYS[way]
         model.policy.set_solver(solver, n_solver_steps)
         model.policy.kv_cache = kv_cache
-        result: dict[str, Any] = roll_out(model, vec_env, options.episodes, options.seed)
-        result["ms_per_call"] = 1e3 * statistics.median(result.pop("seconds"))
-        print(
-            json.dumps({"env": options.env, "model": options.model, "way": way, "seed": options.seed, **result}), flush=True
-        )
+        with tqdm(total=options.episodes, unit="episode", leave=False) as progress:
+            episodes = evaluate(model, vec_env, seeds, lambda n_done, bar=progress: bar.update(n_done - bar.n))
+        print(json.dumps({"env": options.env, "model": options.model, "way": way, **episodes._asdict()}), flush=True)
 
 
 def report(files: list[str]) -> None:
@@ -101,7 +76,7 @@ def main() -> None:
     if options.report:
         report(options.report)
     else:
-        evaluate(options)
+        evaluate_ways(options)
 
 
 if __name__ == "__main__":

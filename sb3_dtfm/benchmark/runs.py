@@ -154,6 +154,21 @@ def final_interval(runs: Sequence[Run]) -> Interval:
     return student_t([row_value(run.final) for run in runs])
 
 
+def late_interval(runs: Sequence[Run]) -> Interval | None:
+    """
+    Late average with Student's interval over runs, as the evaluations of one run repeat the same states.
+
+    :return: cut to [0, 100] for success; None where there was no evaluation during training
+    """
+    values = [value for run in runs if (value := run.value("late")) is not None]
+    if not values:
+        return None
+    interval = student_t(values)
+    if runs[0].counts_success:
+        interval = Interval(*np.clip(interval, 0.0, 100.0).tolist())
+    return interval
+
+
 def _pooled_success(rows: Sequence[Row]) -> Interval:
     successes = np.concatenate([row["successes"] for row in rows])
     return Interval(*(100.0 * limit for limit in wilson(int(successes.sum()), len(successes))))

@@ -11,6 +11,7 @@ from sb3_dtfm.benchmark.runs import (
     Group,
     Run,
     final_interval,
+    late_interval,
     paired_scores,
     spread,
 )
@@ -102,15 +103,25 @@ def _digits(value: float) -> int:
 
 
 def _intervals(group: Group) -> list[str]:
-    rows = [
-        [task, f"{regime:.0%}", *(_final(group.of(task, regime, algo)) for algo in ALGORITHMS)]
-        for task, regime in _cells(group)
-    ]
+    rows = []
+    for task, regime in _cells(group):
+        runs = [group.of(task, regime, algo) for algo in ALGORITHMS]
+        rows.append([task, f"{regime:.0%}", *map(_late, runs), *map(_final, runs)])
+    header = [f"{name} {MEASURES[measure]}" for measure in ("late", "final") for name in ALGORITHMS.values()]
     text = (
-        "Final evaluation with its 95 % interval: Wilson's over the episodes of all seeds for success, Student's t over "
-        "seeds for returns."
+        "95 % intervals. Late average: Student's t over seeds. Final evaluation: Wilson's over the episodes of all seeds "
+        "for success, Student's t over seeds for returns."
     )
-    return [text, "", *_table(["task", "data", *ALGORITHMS.values()], rows)]
+    return [text, "", *_table(["task", "data", *header], rows)]
+
+
+def _late(runs: Sequence[Run]) -> str:
+    if not runs:
+        return NOT_RUN
+    interval = late_interval(runs)
+    if interval is None:
+        return NONE
+    return _bracket(interval, _percent if runs[0].counts_success else _number)
 
 
 def _final(runs: Sequence[Run]) -> str:
