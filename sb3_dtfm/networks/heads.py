@@ -8,6 +8,8 @@ from sb3_dtfm.networks.linear import Linear
 
 # Solver steps whose end the one-step network learns.
 DISTILLED_STEPS = 16
+# What the field's network puts out: the velocity itself, or the action that the path leads to.
+PREDICTIONS = ("velocity", "action")
 
 
 def masked_mean(values: th.Tensor, mask: th.Tensor) -> th.Tensor:
@@ -54,23 +56,39 @@ class FlowHead(nn.Module):
     With `one_step` a second network learns where that ends, so that an action can take one evaluation instead of one per
     solver step. It learns from the field and gives nothing back: trunk and field are what they are without it.
 
+    A network that predicts the action x1 gives the velocity (x1 - x) / (1 - tau). What it has to learn is then bounded, does
+    not depend on the noise where the data have one mode, and is what the last Euler step lands on.
+
     :param embed_dim: D
     :param action_dim: A
     :param hidden_dim: width of the vector field's hidden layers
     :param n_layers: number of hidden layers of the vector field
     :param one_step: have the second network
+    :param prediction: what the field's network puts out, one of `PREDICTIONS`
+    :raises ValueError: unknown prediction
     """
 
     def __init__(
-        self, embed_dim: int, action_dim: int, hidden_dim: int = 512, n_layers: int = 3, one_step: bool = True
+        self,
+        embed_dim: int,
+        action_dim: int,
+        hidden_dim: int = 512,
+        n_layers: int = 3,
+        one_step: bool = True,
+        prediction: str = "velocity",
     ) -> None:
         super().__init__()
+        if prediction not in PREDICTIONS:
+            raise ValueError(f"prediction must be one of {', '.join(PREDICTIONS)}, got {prediction!r}.")
+        self.prediction = prediction
         self.vector_field = VectorField(action_dim, embed_dim, hidden_dim, n_layers)
         self.jump = FilmNetwork(action_dim, embed_dim, hidden_dim, n_layers) if one_step else None
 
     def loss(self, hidden: th.Tensor, actions: th.Tensor, mask: th.Tensor, noise: th.Tensor, tau: th.Tensor) -> th.Tensor:
         """
-        Conditional flow matching (Lipman et al., 2023): squared error of the velocity on the path from noise to action.
+        Conditional flow matching (Lipman et al., 2023): squared error on the path from noise to action.
+
+        Of the velocity, or of the action, which weighs the velocity's by (1 - tau)^2.
 
         :param hidden: (B, K, D)
         :param actions: (B, K, A) in [-1, 1]
@@ -81,7 +99,8 @@ class FlowHead(nn.Module):
         """
         x, velocity = interpolate(noise, actions, tau.unsqueeze(-1))
         film = self.vector_field.film_condition(hidden) + self.vector_field.time_share(tau)
-        return masked_mean((self.vector_field(x, film) - velocity).square(), mask)
+        target = velocity if self.prediction == "velocity" else actions
+        return masked_mean((self.vector_field(x, film) - target).square(), mask)
 
     def one_step_loss(self, hidden: th.Tensor, mask: th.Tensor, noise: th.Tensor) -> th.Tensor:
         """
@@ -113,7 +132,16 @@ class FlowHead(nn.Module):
         times = solver_times(solver, n_solver_steps).to(hidden.device)
         condition, time_shares = self.vector_field.film_condition(hidden), self.vector_field.time_share(times)
 
+        velocity = noise
+
         def field(x: th.Tensor, tau: float) -> th.Tensor:
-            return self.vector_field(x, condition + time_shares[round(tau * (len(times) - 1))])
+            nonlocal velocity
+            i = round(tau * (len(times) - 1))
+            if self.prediction == "velocity":
+                velocity = self.vector_field(x, condition + time_shares[i])
+            elif i < len(times) - 1:
+                velocity = (self.vector_field(x, condition + time_shares[i]) - x) / (1.0 - tau)
+            # Heun and RK4 look at tau = 1 too, where a predicted action gives 0 / 0: the slope before it stands in.
+            return velocity
 
         return integrate(field, noise, solver, n_solver_steps)

@@ -24,6 +24,7 @@ class DTFMPolicy(SequencePolicy):
 
     :param flow_hidden_dim: width of the vector field's hidden layers
     :param flow_n_layers: number of its hidden layers
+    :param flow_prediction: what the vector field's network puts out: "velocity", or "action", which implies the velocity
     :param solver: how to act: an ODE solver, euler, midpoint, heun or rk4; or one_step, the network that learnt its end
     :param n_solver_steps: steps of the ODE solver
     :param one_step: train that network; a few percent of a gradient step, no influence on the rest
@@ -39,6 +40,7 @@ class DTFMPolicy(SequencePolicy):
         *args: Any,
         flow_hidden_dim: int = 512,
         flow_n_layers: int = 3,
+        flow_prediction: str = "velocity",
         solver: str = "euler",
         n_solver_steps: int = 50,
         one_step: bool = True,
@@ -47,6 +49,7 @@ class DTFMPolicy(SequencePolicy):
     ) -> None:
         self.flow_hidden_dim = flow_hidden_dim
         self.flow_n_layers = flow_n_layers
+        self.flow_prediction = flow_prediction
         self.solver = solver
         self.n_solver_steps = n_solver_steps
         self.one_step = one_step
@@ -58,7 +61,8 @@ class DTFMPolicy(SequencePolicy):
 
     def _make_head(self) -> FlowHead:
         self._check_solver(self.solver, self.n_solver_steps)
-        return FlowHead(self.embed_dim, self.action_dim, self.flow_hidden_dim, self.flow_n_layers, self.one_step)
+        sizes = (self.embed_dim, self.action_dim, self.flow_hidden_dim, self.flow_n_layers)
+        return FlowHead(*sizes, self.one_step, self.flow_prediction)
 
     @staticmethod
     def _head(network: SequenceNetwork) -> FlowHead:
@@ -131,5 +135,6 @@ class DTFMPolicy(SequencePolicy):
         return {**super()._acting_settings(), "solver": self.solver, "n_solver_steps": self.n_solver_steps}
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        names = ("flow_hidden_dim", "flow_n_layers", "solver", "n_solver_steps", "one_step", "regression_coef")
-        return {**super()._get_constructor_parameters(), **{name: getattr(self, name) for name in names}}
+        names = ("flow_hidden_dim", "flow_n_layers", "flow_prediction", "solver", "n_solver_steps", "one_step")
+        own = {name: getattr(self, name) for name in (*names, "regression_coef")}
+        return {**super()._get_constructor_parameters(), **own}

@@ -7,7 +7,7 @@ import pytest
 import torch as th
 
 from sb3_dtfm.networks.flow import SOLVERS, VectorField, check_solver, integrate, interpolate, sinusoidal_embedding
-from sb3_dtfm.networks.heads import FlowHead
+from sb3_dtfm.networks.heads import PREDICTIONS, FlowHead
 
 ORDERS = {"euler": 1, "midpoint": 2, "heun": 2, "rk4": 4}
 
@@ -82,10 +82,27 @@ def test_film_halves_add_up_to_one_linear_map_of_time_and_condition():
     assert th.allclose(field(noise, field.film_condition(hidden) + field.time_share(tau)), field.output(x), atol=1e-5)
 
 
-def test_a_flow_head_learns_two_modes_that_regression_would_average():
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("n_solver_steps", [1, 7])
+def test_a_predicted_action_is_where_every_solver_ends(solver, n_solver_steps):
+    head = FlowHead(embed_dim=4, action_dim=2, hidden_dim=8, prediction="action")
+    action = th.tensor([0.3, -0.8])
+    with th.no_grad():
+        head.vector_field.output.weight.zero_()
+        head.vector_field.output.bias.copy_(action)
+        th.testing.assert_close(head(th.randn(5, 4), th.randn(5, 2), solver, n_solver_steps), action.expand(5, 2))
+
+
+def test_unknown_predictions_are_refused_by_name():
+    with pytest.raises(ValueError, match="prediction must be one of velocity, action, got 'noise'"):
+        FlowHead(embed_dim=4, action_dim=2, prediction="noise")
+
+
+@pytest.mark.parametrize("prediction", PREDICTIONS)
+def test_a_flow_head_learns_two_modes_that_regression_would_average(prediction):
     th.manual_seed(0)
     generator = th.Generator().manual_seed(0)
-    head = FlowHead(embed_dim=4, action_dim=1, hidden_dim=64, n_layers=2)
+    head = FlowHead(embed_dim=4, action_dim=1, hidden_dim=64, n_layers=2, prediction=prediction)
     optimizer = th.optim.Adam(head.parameters(), 3e-3)
     hidden, mask = th.zeros(256, 1, 4), th.ones(256, 1, dtype=th.bool)
     for _ in range(400):
