@@ -19,7 +19,7 @@ TARGETS = {
     "robosuite/Lift-v0": 1,
     "robosuite/Can-v0": 1,
 }
-HEAD_KEYS = {"flow_hidden_dim", "flow_n_layers", "solver", "n_solver_steps"}
+HEAD_KEYS = {"flow_hidden_dim", "flow_n_layers", "flow_prediction", "solver", "n_solver_steps", "one_step"}
 SETTINGS = [None, "small"]
 
 
