@@ -296,3 +296,29 @@ def test_the_one_step_network_changes_nothing_else(cheetah_buffer):
     with_it, without_it = weights
     assert with_it.keys() == without_it.keys()
     assert all(th.equal(with_it[name], without_it[name]) for name in with_it)
+
+
+@pytest.mark.parametrize("kv_cache", [False, True])
+@pytest.mark.parametrize(("algorithm", "policy_kwargs"), ALGORITHMS, ids=["dt", "dtfm"])
+def test_a_clipped_return_to_go_stays_within_the_data(algorithm, policy_kwargs, kv_cache, cheetah_buffer, tmp_path):
+    kwargs = {**policy_kwargs, "clip_return_to_go": True, "kv_cache": kv_cache}
+    model = algorithm("MultiInputPolicy", dataset=cheetah_buffer, context_length=3, policy_kwargs=kwargs, seed=0).learn(5)
+    model.save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model")
+    low, high = cheetah_buffer.return_to_go_range()
+    assert (low < high).all()
+
+    def actions(*returns_to_go):
+        """What is done in the first steps of an episode with this return-to-go at each."""
+        state, found = None, []
+        for t, return_to_go in enumerate(returns_to_go):
+            observation = dict(observation=np.full(17, 0.1), return_to_go=np.array([return_to_go]), timestep=np.array([t]))
+            action, state = loaded.predict(observation, state, np.array([t == 0]), deterministic=True)
+            found.append(action)
+        return np.array(found)
+
+    assert np.array_equal(actions(1e6, 1e6), actions(*high[:2].tolist()))
+    assert np.array_equal(actions(-1e6, -1e6), actions(*low[:2].tolist()))
+    assert not np.array_equal(actions(*high[:2].tolist()), actions(*low[:2].tolist()))
+    beyond = dict(observation=np.full(17, 0.1), return_to_go=np.array([0.0]), timestep=np.array([10**6]))
+    assert np.isfinite(loaded.predict(beyond)[0]).all()

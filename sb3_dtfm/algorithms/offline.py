@@ -137,6 +137,8 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
             self.score_reference = buffer.score_reference
             self._setup_model()
             self.policy.set_statistics(*buffer.statistics())
+            if self.policy.clip_return_to_go:
+                self.policy.set_return_to_go_range(buffer.return_to_go_range())
 
     def _check_arguments(self) -> None:
         choices = {"learning_rate_schedule": LEARNING_RATE_SCHEDULES, "precision": PRECISIONS}

@@ -180,6 +180,18 @@ class TrajectoryBuffer:
         """What inputs are normalised by, over the buffer's own steps; reads none of them."""
         return self.episodes.statistics()
 
+    def return_to_go_range(self) -> th.Tensor:
+        """
+        Smallest and largest return-to-go at each time step, over the buffer's own episodes.
+
+        :return: (2, T) of the T steps of the longest episode, environment reward units
+        """
+        timesteps, values = self.timesteps.cpu(), self.returns_to_go[self.rows].cpu()
+        n_timesteps = int(self.episode_lengths.max())
+        low = th.full((n_timesteps,), th.inf).scatter_reduce_(0, timesteps, values, "amin")
+        high = th.full((n_timesteps,), -th.inf).scatter_reduce_(0, timesteps, values, "amax")
+        return th.stack((low, high))
+
     def select(self, episodes: np.ndarray) -> "TrajectoryBuffer":
         """
         A buffer of some of the episodes, in the order given, on the same flat tensors.

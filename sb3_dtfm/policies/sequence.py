@@ -62,6 +62,8 @@ class SequencePolicy(BasePolicy):
     :param n_heads: attention heads
     :param dropout: dropout probability of the trunk
     :param weight_decay: AdamW's, on weight matrices only
+    :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step. Asking for more than
+        any episode reached, or falling behind, then stays an input like those the policy learned from
     :param ema: keep an exponential moving average of the weights and act with it
     :param kv_cache: act on the keys and values kept of earlier steps instead of recomputing the window: two to three times
         faster, and equal until the window slides (see :meth:`SequenceTrunk.extend`); can be set at any time
@@ -73,6 +75,7 @@ class SequencePolicy(BasePolicy):
     observation_mean: th.Tensor
     observation_std: th.Tensor
     return_scale: th.Tensor
+    return_to_go_range: th.Tensor | None
     action_low: th.Tensor
     action_high: th.Tensor
 
@@ -88,6 +91,7 @@ class SequencePolicy(BasePolicy):
         n_heads: int = 2,
         dropout: float = 0.1,
         weight_decay: float = 1e-3,
+        clip_return_to_go: bool = False,
         ema: bool = False,
         kv_cache: bool = False,
         seed: int | None = None,
@@ -100,6 +104,7 @@ class SequencePolicy(BasePolicy):
         self.n_heads = n_heads
         self.dropout = dropout
         self.weight_decay = weight_decay
+        self.clip_return_to_go = clip_return_to_go
         self.ema = ema
         self.kv_cache = kv_cache
         self.seed = seed
@@ -108,6 +113,8 @@ class SequencePolicy(BasePolicy):
         self.register_buffer("observation_mean", th.zeros(self.observation_dim))
         self.register_buffer("observation_std", th.ones(self.observation_dim))
         self.register_buffer("return_scale", th.ones(()))
+        unlimited = th.tensor([[-th.inf], [th.inf]]).repeat(1, max_timestep) if clip_return_to_go else None
+        self.register_buffer("return_to_go_range", unlimited)
         self.register_buffer("action_low", th.as_tensor(action_space.low), persistent=False)
         self.register_buffer("action_high", th.as_tensor(action_space.high), persistent=False)
         self._context: Context | None = None
@@ -193,6 +200,13 @@ class SequencePolicy(BasePolicy):
         self.observation_std.copy_(th.from_numpy(np.where(observation_std > 1e-6, observation_std, 1.0)))
         self.return_scale.fill_(return_scale if return_scale > 0 else 1.0)
 
+    def set_return_to_go_range(self, limits: th.Tensor) -> None:
+        """
+        :param limits: (2, max_timestep), smallest and largest return-to-go by time step, environment reward units
+        """
+        assert self.return_to_go_range is not None
+        self.return_to_go_range.copy_(limits)
+
     def scale_action(self, action: Any) -> Any:
         """From the environment's range to [-1, 1]; accepts tensors (..., A) and, as SB3 does, arrays."""
         if isinstance(action, np.ndarray):
@@ -209,9 +223,13 @@ class SequencePolicy(BasePolicy):
 
     def _normalized(self, windows: SequenceTensors) -> SequenceTensors:
         observations = (windows.observations - self.observation_mean) / self.observation_std
+        returns_to_go = windows.returns_to_go
+        if self.return_to_go_range is not None:
+            low, high = self.return_to_go_range[:, windows.timesteps.clamp(max=self.max_timestep - 1)]
+            returns_to_go = returns_to_go.clamp(low, high)
         return windows._replace(
             observations=observations.clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP),
-            returns_to_go=windows.returns_to_go / self.return_scale,
+            returns_to_go=returns_to_go / self.return_scale,
         )
 
     def scaled_windows(self, batch: Any) -> SequenceTensors:
@@ -365,6 +383,7 @@ class SequencePolicy(BasePolicy):
             "n_heads",
             "dropout",
             "weight_decay",
+            "clip_return_to_go",
             "ema",
             "kv_cache",
             "seed",

@@ -196,3 +196,11 @@ def test_a_buffer_on_its_own_device_stays_as_it_is():
     moved = buffer.to("cpu")
     assert moved.observations.data_ptr() == buffer.observations.data_ptr()
     assert moved.device == th.device("cpu")
+
+
+def test_the_range_of_the_return_to_go_by_hand():
+    trajectories = [
+        make_trajectory(len(rewards), rewards=np.array(rewards)) for rewards in ([1, 2, 3], [5, -1], [9, 9, 9, 9])
+    ]
+    buffer = TrajectoryBuffer.from_trajectories(trajectories, ACTION_SPACE, OBSERVATION_SPACE)
+    assert buffer.select(np.array([1, 0])).return_to_go_range().tolist() == [[4, -1, 3], [6, 5, 3]]
