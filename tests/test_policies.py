@@ -127,6 +127,14 @@ def test_fresh_noise_differs_and_deterministic_noise_is_not_zero(cheetah_buffer)
     assert th.equal(noise, model.policy._acting_noise(timesteps, deterministic=True))
 
 
+def test_deterministic_noise_has_the_asked_deviation_and_fresh_noise_always_one(cheetah_buffer):
+    model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=TINY_FLOW_POLICY, seed=0)
+    timesteps = th.arange(1000)
+    model.policy.deterministic_noise_std = 0.25
+    assert model.policy._acting_noise(timesteps, deterministic=True).std().item() == pytest.approx(0.25, rel=0.05)
+    assert model.policy._acting_noise(timesteps, deterministic=False).std().item() == pytest.approx(1.0, rel=0.05)
+
+
 def test_normalisation_is_the_datasets(model, cheetah_buffer):
     observations = cheetah_buffer.observations.numpy()
     assert np.allclose(model.policy.observation_mean, observations.mean(0), atol=1e-4)
@@ -272,9 +280,11 @@ def test_a_way_of_acting_that_was_chosen_after_training_is_saved(cheetah_buffer,
     model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=TINY_FLOW_POLICY, seed=0)
     model.policy.set_solver("heun", 3)
     model.policy.kv_cache = True
+    model.policy.deterministic_noise_std = 0.5
     model.save(tmp_path / "model.zip")
     loaded = DTFM.load(tmp_path / "model.zip")
     assert (loaded.policy.solver, loaded.policy.n_solver_steps, loaded.policy.kv_cache) == ("heun", 3, True)
+    assert loaded.policy.deterministic_noise_std == 0.5
     assert np.array_equal(roll_plain(model, 8), roll_plain(loaded, 8))
 
 

@@ -26,6 +26,7 @@ KEYS: dict[str, tuple[type, ...]] = {
     "commit": (str, type(None)),
     "versions": (dict,),
     "hardware": (dict,),
+    "settings": (dict,),
     "data": (dict,),
 }
 EPISODE_KEYS = ("returns", "lengths", "successes")

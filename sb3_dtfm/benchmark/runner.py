@@ -147,7 +147,7 @@ class Runner:
         train += ["--num-threads", str(self._n_threads())]
         if options.env_kwargs:
             train += ["--env-kwargs", *options.env_kwargs]
-        row = {**cell._asdict(), "data": job.data}
+        row = {**cell._asdict(), "settings": job.settings, "data": job.data}
         return {"train": train, "row": row, "final_episodes": options.final_episodes, "parent": os.getpid()}
 
     def _finish(self, cell: RunningCell, display: Display) -> None:

@@ -27,6 +27,8 @@ class DTFMPolicy(SequencePolicy):
     :param flow_prediction: what the vector field's network puts out: "velocity", or "action", which implies the velocity
     :param solver: how to act: an ODE solver, euler, midpoint, heun or rk4; or one_step, the network that learnt its end
     :param n_solver_steps: steps of the ODE solver
+    :param deterministic_noise_std: standard deviation of the noise that `deterministic=True` starts from. 1 is what was
+        learned from: actions as varied as the data's. Less keeps nearer to the middle of each mode
     :param one_step: train that network; a few percent of a gradient step, no influence on the rest
     :param regression_coef: weight of the auxiliary action regression; 0 leaves it out
 
@@ -43,6 +45,7 @@ class DTFMPolicy(SequencePolicy):
         flow_prediction: str = "velocity",
         solver: str = "euler",
         n_solver_steps: int = 50,
+        deterministic_noise_std: float = 1.0,
         one_step: bool = True,
         regression_coef: float = 0.0,
         **kwargs: Any,
@@ -52,6 +55,7 @@ class DTFMPolicy(SequencePolicy):
         self.flow_prediction = flow_prediction
         self.solver = solver
         self.n_solver_steps = n_solver_steps
+        self.deterministic_noise_std = deterministic_noise_std
         self.one_step = one_step
         self.regression_coef = regression_coef
         super().__init__(*args, **kwargs)
@@ -122,7 +126,7 @@ class DTFMPolicy(SequencePolicy):
 
     def _acting_noise(self, timestep: th.Tensor, deterministic: bool) -> th.Tensor:
         if deterministic:
-            return self.noise_table[timestep % NOISE_PERIOD]
+            return self.deterministic_noise_std * self.noise_table[timestep % NOISE_PERIOD]
         if self._acting_generator is None:
             self._acting_generator = th.Generator(self.device)
             if self.seed is None:
@@ -132,9 +136,10 @@ class DTFMPolicy(SequencePolicy):
         return standard_normal(len(timestep), self.action_dim, self._acting_generator)
 
     def _acting_settings(self) -> dict[str, Any]:
-        return {**super()._acting_settings(), "solver": self.solver, "n_solver_steps": self.n_solver_steps}
+        names = ("solver", "n_solver_steps", "deterministic_noise_std")
+        return {**super()._acting_settings(), **{name: getattr(self, name) for name in names}}
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        names = ("flow_hidden_dim", "flow_n_layers", "flow_prediction", "solver", "n_solver_steps", "one_step")
-        own = {name: getattr(self, name) for name in (*names, "regression_coef")}
-        return {**super()._get_constructor_parameters(), **own}
+        names = ("flow_hidden_dim", "flow_n_layers", "flow_prediction", "one_step", "regression_coef")
+        own = {name: getattr(self, name) for name in names}
+        return {**super()._get_constructor_parameters(), **own, **self._acting_settings()}

@@ -371,7 +371,7 @@ class SequencePolicy(BasePolicy):
 
     def set_extra_state(self, state: th.Tensor) -> None:
         settings = json.loads(bytes(state.tolist()))
-        for name in self._acting_settings():
+        for name in self._acting_settings().keys() & settings:  # a file of an earlier version may lack some
             setattr(self, name, settings[name])
 
     def _get_constructor_parameters(self) -> dict[str, Any]:

@@ -29,6 +29,7 @@ def make_row(**changes: Any) -> Row:
         "commit": "0123456789abcdef",
         "versions": {"torch": "2.13.0"},
         "hardware": {"cpu": "a CPU", "cores": 2, "threads": 1, "gpu": None},
+        "settings": {},
         "data": {
             "dataset": "lift.hdf5",
             "recorded_from": "a script",

@@ -19,7 +19,15 @@ TARGETS = {
     "robosuite/Lift-v0": 1,
     "robosuite/Can-v0": 1,
 }
-HEAD_KEYS = {"flow_hidden_dim", "flow_n_layers", "flow_prediction", "solver", "n_solver_steps", "one_step"}
+HEAD_KEYS = {
+    "flow_hidden_dim",
+    "flow_n_layers",
+    "flow_prediction",
+    "solver",
+    "n_solver_steps",
+    "one_step",
+    "deterministic_noise_std",
+}
 SETTINGS = [None, "small"]
 
 
@@ -47,7 +55,7 @@ def test_every_task_builds_its_model(env_id, settings):
         hyperparams = load(algo, settings)[env_id]
         wrapped = get_wrapper_class(hyperparams)(env)
         assert wrapped.get_wrapper_attr("target_return") == TARGETS[env_id]
-        assert hyperparams.pop("n_timesteps") >= 1500
+        assert hyperparams.pop("n_timesteps") >= 1200
         assert isinstance(hyperparams.pop("dataset"), str)
         del hyperparams["env_wrapper"]
         model = algorithm(env=wrapped, dataset=buffer, device="cpu", **hyperparams)
