@@ -16,8 +16,9 @@ class Context(NamedTuple):
     Windows of B environments, newest step last, padded on the left.
 
     Shapes: observations (B, K, O) as the environment gives them, actions (B, K, A) in [-1, 1], returns_to_go (B, K) in
-    environment reward units, timesteps (B, K) int64, mask (B, K) bool, False on padded steps, keys_values (B, ...), what the
-    policy keeps of its earlier computation, (B, 0) if nothing.
+    environment reward units, timesteps (B, K) int64, mask (B, K) bool, False on padded steps, episode_keys (B,) int64, a
+    hash of each episode's first observation, keys_values (B, ...), what the policy keeps of its earlier computation, (B, 0)
+    if nothing.
     """
 
     observations: np.ndarray
@@ -25,6 +26,7 @@ class Context(NamedTuple):
     returns_to_go: np.ndarray
     timesteps: np.ndarray
     mask: np.ndarray
+    episode_keys: np.ndarray
     keys_values: np.ndarray
 
 
@@ -36,6 +38,7 @@ def empty_context(n_rows: int, context_length: int, observation_dim: int, action
         np.zeros((n_rows, context_length), np.float32),
         np.zeros((n_rows, context_length), np.int64),
         np.zeros((n_rows, context_length), bool),
+        np.zeros(n_rows, np.int64),
         np.zeros((n_rows, 0), np.float32),
     )
 
@@ -61,6 +64,7 @@ def push(
     restart = timestep != context.timesteps[:, -1] + 1
     if episode_start is not None:
         restart |= np.asarray(episode_start, dtype=bool)
+    first_bits = np.ascontiguousarray(observation, np.float32).view(np.int32).sum(axis=1, dtype=np.int64)
     keep = ~restart[:, None]
     no_action = np.zeros_like(context.actions[:, 0])
     return Context(
@@ -69,6 +73,7 @@ def push(
         _shift(context.returns_to_go, return_to_go),
         _shift(context.timesteps, timestep),
         np.concatenate((context.mask[:, 1:] & keep, np.ones_like(keep)), axis=1),
+        np.where(restart, first_bits, context.episode_keys),
         context.keys_values,
     )
 

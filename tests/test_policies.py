@@ -120,19 +120,41 @@ def test_fresh_noise_differs_and_deterministic_noise_is_not_zero(cheetah_buffer)
     observation, _ = make_env().reset(seed=0)
     drawn = [model.predict(observation, deterministic=False)[0] for _ in range(2)]
     assert not np.allclose(*drawn)
-    timesteps = th.tensor([0, 1, 7])
-    noise = model.policy._acting_noise(timesteps, deterministic=True)
+    timesteps, episode = th.tensor([0, 1, 7]), th.tensor([5, 5, 5])
+    noise = model.policy._acting_noise(timesteps, episode, deterministic=True)
     assert noise.abs().min() > 0
-    assert not th.allclose(noise[0], noise[1])
-    assert th.equal(noise, model.policy._acting_noise(timesteps, deterministic=True))
+    assert len(noise.unique(dim=0)) == 3
+    assert th.equal(noise, model.policy._acting_noise(timesteps, episode, deterministic=True))
+
+
+def test_episodes_that_start_elsewhere_have_another_deterministic_noise(cheetah_buffer, monkeypatch):
+    drawn = []
+    generate = DTFMPolicy._generate
+    monkeypatch.setattr(
+        DTFMPolicy, "_generate", lambda self, hidden, noise: drawn.append(noise) or generate(self, hidden, noise)
+    )
+    model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=TINY_FLOW_POLICY, seed=0)
+    starts = np.random.default_rng(0).normal(size=(50, 17)).astype(np.float32)
+    starts[1] = starts[0]
+    state = None
+    for t in range(3):
+        observation = dict(observation=starts + t, return_to_go=np.zeros((50, 1)), timestep=np.full((50, 1), t))
+        _, state = model.predict(observation, state, np.full(50, t == 0), deterministic=True)
+    for noise in drawn:
+        assert th.equal(noise[0], noise[1])
+        assert len(noise.unique(dim=0)) > 40  # 49 draws of 1,024 rows: about 48
+    # Within an episode the rows of the table follow each other, whatever is observed.
+    row = (model.policy.noise_table == drawn[0][2]).all(dim=1).nonzero().item()
+    assert th.equal(model.policy.noise_table.roll(-row - 1, 0)[:2], th.stack([drawn[1][2], drawn[2][2]]))
 
 
 def test_deterministic_noise_has_the_asked_deviation_and_fresh_noise_always_one(cheetah_buffer):
     model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=TINY_FLOW_POLICY, seed=0)
     timesteps = th.arange(1000)
     model.policy.deterministic_noise_std = 0.25
-    assert model.policy._acting_noise(timesteps, deterministic=True).std().item() == pytest.approx(0.25, rel=0.05)
-    assert model.policy._acting_noise(timesteps, deterministic=False).std().item() == pytest.approx(1.0, rel=0.05)
+    for deterministic, deviation in ((True, 0.25), (False, 1.0)):
+        noise = model.policy._acting_noise(timesteps, th.zeros_like(timesteps), deterministic)
+        assert noise.std().item() == pytest.approx(deviation, rel=0.05)
 
 
 def test_normalisation_is_the_datasets(model, cheetah_buffer):

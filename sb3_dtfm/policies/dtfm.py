@@ -9,8 +9,8 @@ from sb3_dtfm.networks.flow import ONE_STEP, check_solver
 from sb3_dtfm.networks.heads import FlowHead, RegressionHead
 from sb3_dtfm.policies.sequence import SequenceNetwork, SequencePolicy, standard_normal
 
-# Steps after which deterministic acting repeats its noise; longer than a usual episode.
-NOISE_PERIOD = 1024
+# Rows of the table that deterministic acting takes its noise from.
+NOISE_ROWS = 1024
 # Newest steps of each window that the one-step network learns from: where acting asks it, and few enough to cost little.
 ONE_STEP_POSITIONS = 4
 
@@ -19,8 +19,10 @@ class DTFMPolicy(SequencePolicy):
     """
     Decision Transformer with flow matching: the hidden state conditions a vector field from noise to action.
 
-    `deterministic=True` starts from noise that belongs to the time step: drawn once from `seed`, saved with the model.
-    Zero noise would be one point of the distribution, and following the same mode for ever gets an arm stuck.
+    `deterministic=True` starts from noise that belongs to the time step and the episode: rows of a table that is drawn once
+    from `seed` and saved with the model, from a row on that the episode's first observation decides. Zero noise would be one
+    point of the distribution, and following the same mode for ever gets an arm stuck; the same rows in every episode would
+    give all of them the same luck.
 
     :param flow_hidden_dim: width of the vector field's hidden layers
     :param flow_n_layers: number of its hidden layers
@@ -60,7 +62,7 @@ class DTFMPolicy(SequencePolicy):
         self.regression_coef = regression_coef
         super().__init__(*args, **kwargs)
         noise_generator = th.Generator().manual_seed(0 if self.seed is None else self.seed)
-        self.register_buffer("noise_table", standard_normal(NOISE_PERIOD, self.action_dim, noise_generator))
+        self.register_buffer("noise_table", standard_normal(NOISE_ROWS, self.action_dim, noise_generator))
         self._acting_generator: th.Generator | None = None
 
     def _make_head(self) -> FlowHead:
@@ -124,9 +126,9 @@ class DTFMPolicy(SequencePolicy):
         self.solver = solver
         self.n_solver_steps = n_solver_steps
 
-    def _acting_noise(self, timestep: th.Tensor, deterministic: bool) -> th.Tensor:
+    def _acting_noise(self, timestep: th.Tensor, episode_key: th.Tensor, deterministic: bool) -> th.Tensor:
         if deterministic:
-            return self.deterministic_noise_std * self.noise_table[timestep % NOISE_PERIOD]
+            return self.deterministic_noise_std * self.noise_table[(timestep + episode_key) % NOISE_ROWS]
         if self._acting_generator is None:
             self._acting_generator = th.Generator(self.device)
             if self.seed is None:

@@ -38,6 +38,9 @@ class SequenceTensors(NamedTuple):
     mask: th.Tensor
 
 
+N_WINDOWS = len(SequenceTensors._fields)  # so many fields of a context, its first ones
+
+
 class SequenceNetwork(nn.Module):
     """Everything that is trained: the trunk, the action head and, if asked for, the auxiliary regression head."""
 
@@ -307,13 +310,15 @@ class SequencePolicy(BasePolicy):
             self.set_training_mode(False)  # goes through all modules
         device = self.device  # SB3 looks for it among the parameters each time
         with th.inference_mode():
-            windows = SequenceTensors(*(th.from_numpy(array).to(device) for array in context[:-1]))
+            windows = SequenceTensors(*(th.from_numpy(array).to(device) for array in context[:N_WINDOWS]))
             if self.kv_cache and self.context_length > 1:
                 hidden, keys_values = self._extend(self._normalized(windows), context.keys_values)
             else:
                 hidden = self.hidden_states(self.acting_network, windows, last_only=True).squeeze(1)
                 keys_values = np.zeros((len(hidden), 0), np.float32)
-            noise = self._acting_noise(windows.timesteps[:, -1], deterministic)
+            noise = self._acting_noise(
+                windows.timesteps[:, -1], th.from_numpy(context.episode_keys).to(device), deterministic
+            )
             with threads_for(len(hidden)):
                 actions = self._generate(hidden, noise).clamp(-1.0, 1.0)
             return actions.cpu().numpy(), keys_values
@@ -340,11 +345,12 @@ class SequencePolicy(BasePolicy):
                 kept = self._keys_values.keep(keys_values)
         return hidden, kept
 
-    def _acting_noise(self, timestep: th.Tensor, deterministic: bool) -> th.Tensor:
+    def _acting_noise(self, timestep: th.Tensor, episode_key: th.Tensor, deterministic: bool) -> th.Tensor:
         """
         What acting starts from; a policy that needs no noise leaves this as it is.
 
         :param timestep: (B,)
+        :param episode_key: (B,) int64, a number that belongs to the episode
         """
         return th.zeros(len(timestep), self.action_dim, device=self.device)
 
