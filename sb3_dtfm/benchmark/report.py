@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from sb3_dtfm.benchmark.changes import split_changes
 from sb3_dtfm.benchmark.plots import check_baselines, plot_group, read_baseline
 from sb3_dtfm.benchmark.rows import merge_rows, result_files
 from sb3_dtfm.benchmark.runs import Group, group_runs
@@ -51,7 +52,7 @@ def main(argv: Sequence[str]) -> None:
     check_baselines(baselines, list(dict.fromkeys(task for group in groups for task in group.tasks)))
     output = Path(options.output)
     figures = {}
-    for group in groups:
+    for group in split_changes(groups)[0]:
         figures[group.title] = figure_name(group)
         print(plot_group(group, output / figures[group.title], baselines, not options.no_agent_line))
     report = output / "report.md"

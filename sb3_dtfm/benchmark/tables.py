@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Sequence
 
+from sb3_dtfm.benchmark.changes import changed_settings, compared_cells, split_changes
 from sb3_dtfm.benchmark.rows import Cell
 from sb3_dtfm.benchmark.runs import (
     ALGORITHMS,
@@ -40,10 +41,13 @@ def make_report(groups: Sequence[Group], figures: dict[str, str], unfinished: Se
     :return: Markdown
     """
     parts = ["# DT and DTFM compared", ""]
-    for group in groups:
+    alone, changed = split_changes(groups)
+    for group in alone:
         parts += [f"## Settings: {group.title}", "", f"![learning curves]({figures[group.title]})", "", CAPTION, ""]
         parts += [*_achieved(group), "", *_intervals(group), "", *_scores(group), "", *_aggregates(group), ""]
         parts += [*_time(group), "", *_sources(group), ""]
+    for base, labelled in changed:
+        parts += [f"## Changes to: {base.title}", "", *_changes(base, labelled), ""]
     if unfinished:
         parts += ["Left out, as they have no final evaluation: " + "; ".join(map(str, unfinished)) + ".", ""]
     return "\n".join(parts)
@@ -238,6 +242,25 @@ def _pace(runs: Sequence[Run]) -> list[str]:
     steps_per_s = sum(run.final["steps_per_s"] for run in runs) / len(runs)
     paces = [100.0 * score / run.minutes for run in runs if (score := run.score("final")) is not None and run.minutes > 0]
     return [f"{minutes:.1f}", f"{steps_per_s:.1f}", f"{sum(paces) / len(paces):.1f}" if paces else NONE]
+
+
+def _changes(base: Group, labelled: Sequence[Group]) -> list[str]:
+    rows = []
+    for group in labelled:
+        for task, regime, algo, runs, same in compared_cells(base, group):
+            settings = _escape(changed_settings(runs[0], base.of(task, regime, algo)))
+            minutes = f"{sum(run.minutes for run in runs) / len(runs):.1f}"
+            results = [_mean_and_deviation(each, measure) for measure in ("late", "final") for each in (runs, same)]
+            rows.append(
+                [group.label, settings or NONE, task, f"{regime:.0%}", ALGORITHMS[algo], *results, str(len(runs)), minutes]
+            )
+    measures = [f"{MEASURES[measure]}{which}" for measure in ("late", "final") for which in ("", " without")]
+    text = (
+        "What a label's settings did, beside the runs without it of the same seeds: mean ± standard deviation over seeds, "
+        "success in percent or mean return; minutes of training."
+    )
+    header = ["label", "settings", "task", "data", "algorithm", *measures, "seeds", "minutes"]
+    return [text, "", *_table(header, rows)]
 
 
 def _sources(group: Group) -> list[str]:

@@ -80,9 +80,26 @@ def test_the_report_shows_what_was_run_and_what_was_not(tmp_path, capsys):
     assert table_row(text, "final evaluation")[0][2] == "1.00 [1.00, 1.00]"
     assert "Left out, as they have no final evaluation: HalfCheetah-v5, 100% of the data, dt, seed 0, small." in text
     assert "`local/halfcheetah/expert-v0`, 100 episodes, recorded from TQC: sampled actions" in text
-    for name in ("curves-small.png", "curves-small-ema.png"):
-        assert f"]({name})" in text
-        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+    assert "](curves-small.png)" in text
+    assert (tmp_path / "curves-small.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_label_stands_beside_the_same_cell_without_it(tmp_path):
+    assert main(["report", str(ROWS), "-o", str(tmp_path)]) == 0
+    settings = (
+        "`ema_decay: 0.99` (not 0.999), `kv_cache: True`, `target_return: 9000.0` (not 12000.0), no `warmup_steps` (not 5)"
+    )
+    (row,) = table_row((tmp_path / "report.md").read_text(), "ema")
+    assert row == [settings, CHEETAH, "50%", "DTFM", "-", "6,050", "9,000", "8,000", "1", "2.0"]
+    assert not (tmp_path / "curves-small-ema.png").exists()
+
+
+def test_a_label_alone_is_a_group_of_its_own(tmp_path):
+    rows = [line for line in (ROWS / "halfcheetah.jsonl").read_text().splitlines() if '"label": "ema"' in line]
+    (tmp_path / "ema.jsonl").write_text("\n".join(rows) + "\n")
+    assert main(["report", str(tmp_path), "-o", str(tmp_path)]) == 0
+    assert "## Settings: small, ema" in (tmp_path / "report.md").read_text()
+    assert (tmp_path / "curves-small-ema.png").exists()
 
 
 def test_a_baseline_is_drawn(tmp_path, monkeypatch):

@@ -1,0 +1,72 @@
+"""What `--label`s changed: the settings that differ from the profile's own, and what became of the results."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from sb3_dtfm.benchmark.runs import ALGORITHMS, Group, Run
+
+# Settings that the grid gives each cell, and the seed that RL-Zoo adds.
+NOT_A_CHANGE = ("dataset", "dataset_fraction", "dataset_seed")
+
+
+def split_changes(groups: Sequence[Group]) -> tuple[list[Group], list[tuple[Group, list[Group]]]]:
+    """
+    Groups that stand for themselves, and those to be compared with the same profile without a label.
+
+    :return: the former; and each group without a label, with its labelled ones if it has any
+    """
+    plain = {group.profile: group for group in groups if not group.label}
+    alone = [group for group in groups if not group.label or group.profile not in plain]
+    changed = [
+        (base, labelled)
+        for base in plain.values()
+        if (labelled := [group for group in groups if group.label and group.profile == base.profile])
+    ]
+    return alone, changed
+
+
+def changed_settings(run: Run, base: Sequence[Run]) -> str:
+    """
+    The settings of a run that differ from those of the runs without a label.
+
+    :param base: runs of the same task and algorithm, of any seed and share of the data
+    :return: `key: value` for each, with the value before; empty if nothing differs or nothing is there to compare
+    """
+    if not base:
+        return ""
+    before, now = (_flat(each.final["settings"]) for each in (base[0], run))
+    parts = []
+    for key in sorted(before.keys() | now.keys()):
+        if key in NOT_A_CHANGE or before.get(key) == now.get(key):
+            continue
+        old = f" (not {before[key]})" if key in before else ""
+        parts.append(f"`{key}: {now[key]}`{old}" if key in now else f"no `{key}`{old}")
+    return ", ".join(parts)
+
+
+def _flat(settings: dict[str, Any]) -> dict[str, Any]:
+    """`policy_kwargs` beside the others, and the target return out of its wrapper."""
+    flat = {key: value for key, value in settings.items() if key not in ("policy_kwargs", "env_wrapper")}
+    flat.update(settings.get("policy_kwargs") or {})
+    for wrapper in settings.get("env_wrapper") or []:
+        for arguments in wrapper.values() if isinstance(wrapper, dict) else []:
+            flat.update(arguments)
+    return flat
+
+
+def compared_cells(base: Group, changed: Group) -> list[tuple[str, float, str, list[Run], list[Run]]]:
+    """
+    The cells of a labelled group beside those without a label.
+
+    :return: task, share of the data, algorithm, the labelled runs, and the others with the same seeds
+    """
+    cells = []
+    for task in changed.tasks:
+        for regime in changed.regimes:
+            for algo in ALGORITHMS:
+                runs = changed.of(task, regime, algo)
+                seeds = {run.cell.seed for run in runs}
+                same = [run for run in base.of(task, regime, algo) if run.cell.seed in seeds]
+                if runs:
+                    cells.append((task, regime, algo, runs, same))
+    return cells
