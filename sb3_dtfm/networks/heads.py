@@ -16,8 +16,8 @@ def masked_mean(values: th.Tensor, mask: th.Tensor) -> th.Tensor:
     """
     Mean over valid steps and all action dimensions.
 
-    :param values: (B, K, A)
-    :param mask: (B, K) bool, at least one True
+    :param values: (..., A)
+    :param mask: (...) bool, at least one True
     """
     per_step = values.float().mean(dim=-1)
     return (per_step * mask).sum() / mask.sum()
@@ -93,14 +93,15 @@ class FlowHead(nn.Module):
         :param hidden: (B, K, D)
         :param actions: (B, K, A) in [-1, 1]
         :param mask: (B, K) bool
-        :param noise: (B, K, A), standard normal
-        :param tau: (B, K), uniform in [0, 1]
-        :return: mean squared error over valid steps
+        :param noise: (B, n, K, A), standard normal: n draws for each hidden state
+        :param tau: (B, n, K), uniform in [0, 1]
+        :return: mean squared error over valid steps and draws
         """
+        actions = actions.unsqueeze(1)
         x, velocity = interpolate(noise, actions, tau.unsqueeze(-1))
-        film = self.vector_field.film_condition(hidden) + self.vector_field.time_share(tau)
+        film = self.vector_field.film_condition(hidden).unsqueeze(1) + self.vector_field.time_share(tau)
         target = velocity if self.prediction == "velocity" else actions
-        return masked_mean((self.vector_field(x, film) - target).square(), mask)
+        return masked_mean((self.vector_field(x, film) - target).square(), mask.unsqueeze(1).expand(tau.shape))
 
     def one_step_loss(self, hidden: th.Tensor, mask: th.Tensor, noise: th.Tensor) -> th.Tensor:
         """

@@ -27,6 +27,7 @@ class DTFMPolicy(SequencePolicy):
     :param flow_hidden_dim: width of the vector field's hidden layers
     :param flow_n_layers: number of its hidden layers
     :param flow_prediction: what the vector field's network puts out: "velocity", or "action", which implies the velocity
+    :param n_flow_draws: pairs of noise and tau for each hidden state and gradient step: the head is cheap beside the trunk
     :param solver: how to act: an ODE solver, euler, midpoint, heun or rk4; or one_step, the network that learnt its end
     :param n_solver_steps: steps of the ODE solver
     :param deterministic_noise_std: standard deviation of the noise that `deterministic=True` starts from. 1 is what was
@@ -45,6 +46,7 @@ class DTFMPolicy(SequencePolicy):
         flow_hidden_dim: int = 512,
         flow_n_layers: int = 3,
         flow_prediction: str = "velocity",
+        n_flow_draws: int = 1,
         solver: str = "euler",
         n_solver_steps: int = 50,
         deterministic_noise_std: float = 1.0,
@@ -55,6 +57,9 @@ class DTFMPolicy(SequencePolicy):
         self.flow_hidden_dim = flow_hidden_dim
         self.flow_n_layers = flow_n_layers
         self.flow_prediction = flow_prediction
+        if n_flow_draws < 1:
+            raise ValueError(f"n_flow_draws must be at least 1, got {n_flow_draws}.")
+        self.n_flow_draws = n_flow_draws
         self.solver = solver
         self.n_solver_steps = n_solver_steps
         self.deterministic_noise_std = deterministic_noise_std
@@ -79,8 +84,10 @@ class DTFMPolicy(SequencePolicy):
         return RegressionHead(self.embed_dim, self.action_dim) if self.regression_coef > 0 else None
 
     def draw_noise(self, batch: Any, generator: th.Generator) -> tuple[th.Tensor, ...]:
-        noise = th.randn(batch.actions.shape, generator=generator, device=batch.actions.device)
-        tau = th.rand(batch.mask.shape, generator=generator, device=batch.mask.device)
+        n_rows, length, action_dim = batch.actions.shape
+        shape, device = (n_rows, self.n_flow_draws, length), batch.actions.device
+        noise = th.randn(*shape, action_dim, generator=generator, device=device)
+        tau = th.rand(shape, generator=generator, device=device)
         return noise, tau
 
     def compute_loss(self, batch: Any, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
@@ -95,7 +102,7 @@ class DTFMPolicy(SequencePolicy):
             loss = loss + self.regression_coef * parts["regression_loss"]
         if self.one_step:
             newest = slice(-ONE_STEP_POSITIONS, None)
-            parts["one_step_loss"] = head.one_step_loss(hidden[:, newest], windows.mask[:, newest], starts[:, newest])
+            parts["one_step_loss"] = head.one_step_loss(hidden[:, newest], windows.mask[:, newest], starts[:, 0, newest])
             loss = loss + parts["one_step_loss"]
         return loss, parts
 
@@ -142,6 +149,6 @@ class DTFMPolicy(SequencePolicy):
         return {**super()._acting_settings(), **{name: getattr(self, name) for name in names}}
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        names = ("flow_hidden_dim", "flow_n_layers", "flow_prediction", "one_step", "regression_coef")
+        names = ("flow_hidden_dim", "flow_n_layers", "flow_prediction", "n_flow_draws", "one_step", "regression_coef")
         own = {name: getattr(self, name) for name in names}
         return {**super()._get_constructor_parameters(), **own, **self._acting_settings()}

@@ -93,6 +93,23 @@ def test_a_predicted_action_is_where_every_solver_ends(solver, n_solver_steps):
         th.testing.assert_close(head(th.randn(5, 4), th.randn(5, 2), solver, n_solver_steps), action.expand(5, 2))
 
 
+@pytest.mark.parametrize("prediction", PREDICTIONS)
+def test_the_loss_of_several_draws_is_the_mean_of_each_over_valid_steps(prediction):
+    head = FlowHead(embed_dim=4, action_dim=2, hidden_dim=8, prediction=prediction)
+    hidden, actions = th.randn(3, 5, 4), th.rand(3, 5, 2)
+    noise, tau = th.randn(3, 4, 5, 2), th.rand(3, 4, 5)
+    mask = th.tensor([[0, 0, 1, 1, 1], [1, 1, 1, 1, 1], [0, 1, 1, 1, 1]], dtype=th.bool)
+    each = [head.loss(hidden, actions, mask, noise[:, i : i + 1], tau[:, i : i + 1]) for i in range(4)]
+    th.testing.assert_close(head.loss(hidden, actions, mask, noise, tau), th.stack(each).mean())
+    by_hand = []
+    for row, step in mask.nonzero().tolist():
+        x = (1 - tau[row, 0, step]) * noise[row, 0, step] + tau[row, 0, step] * actions[row, step]
+        film = head.vector_field.film_condition(hidden[row, step]) + head.vector_field.time_share(tau[row, 0, step])
+        target = actions[row, step] - (noise[row, 0, step] if prediction == "velocity" else 0)
+        by_hand.append((head.vector_field(x, film) - target).square().mean())
+    th.testing.assert_close(each[0], th.stack(by_hand).mean())
+
+
 def test_unknown_predictions_are_refused_by_name():
     with pytest.raises(ValueError, match="prediction must be one of velocity, action, got 'noise'"):
         FlowHead(embed_dim=4, action_dim=2, prediction="noise")
@@ -109,7 +126,7 @@ def test_a_flow_head_learns_two_modes_that_regression_would_average(prediction):
         actions = th.where(th.rand(256, 1, 1, generator=generator) < 0.5, -0.7, 0.7)
         noise, tau = th.randn(256, 1, 1, generator=generator), th.rand(256, 1, generator=generator)
         optimizer.zero_grad()
-        (head.loss(hidden, actions, mask, noise, tau) + head.one_step_loss(hidden, mask, noise)).backward()
+        (head.loss(hidden, actions, mask, noise[:, None], tau[:, None]) + head.one_step_loss(hidden, mask, noise)).backward()
         optimizer.step()
     with th.no_grad():
         samples = head(th.zeros(500, 4), th.randn(500, 1, generator=generator), n_solver_steps=20)
