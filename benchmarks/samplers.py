@@ -9,6 +9,7 @@ Prints one line of JSON for each way; `--report FILES` adds up such lines over m
 import argparse
 import json
 from collections import defaultdict
+from itertools import product
 from pathlib import Path
 
 import gymnasium as gym
@@ -25,6 +26,8 @@ from sb3_dtfm.zoo.plots import wilson_interval
 WAYS = {
     "50 Euler steps": ("euler", 50, False),
     "10 Euler steps": ("euler", 10, False),
+    "5 Heun steps": ("heun", 5, False),
+    "3 Euler steps": ("euler", 3, False),
     "1 Euler step": ("euler", 1, False),
     "one step": ("one_step", 1, False),
     "50 Euler steps, kv_cache": ("euler", 50, True),
@@ -42,24 +45,35 @@ def evaluate_ways(options: argparse.Namespace) -> None:
     vec_env = DummyVecEnv([lambda: make_env(options.env, options.target_return)] * options.n_envs)
     model = DTFM.load(options.model, device="cpu")
     seeds = range(options.seed, options.seed + options.episodes)
-    for way in options.ways:
+    deviations = options.noise_std or [model.policy.deterministic_noise_std]
+    for way, deviation in product(options.ways, deviations):
         solver, n_solver_steps, kv_cache = WAYS[way]
         model.policy.set_solver(solver, n_solver_steps)
         model.policy.kv_cache = kv_cache
+        model.policy.deterministic_noise_std = deviation
         with tqdm(total=options.episodes, unit="episode", leave=False) as progress:
             episodes = evaluate(model, vec_env, seeds, lambda n_done, bar=progress: bar.update(n_done - bar.n))
-        print(json.dumps({"env": options.env, "model": options.model, "way": way, **episodes._asdict()}), flush=True)
+        name = f"{way}, noise {deviation:g}"
+        print(json.dumps({"env": options.env, "model": options.model, "way": name, **episodes._asdict()}), flush=True)
 
 
 def report(files: list[str]) -> None:
-    cells: dict[tuple[str, str], list[float]] = defaultdict(list)
+    """Success where the task has it, else returns; episodes of all models of a task together."""
+    cells: dict[tuple[str, str], dict[str, list[float]]] = defaultdict(lambda: {"returns": [], "successes": []})
     for line in (line for file in files for line in Path(file).read_text().splitlines()):
         row = json.loads(line)
-        cells[row["env"], row["way"]] += row["successes"]
-    print("| task | acting | success | 95 % interval | episodes |\n| --- | --- | --- | --- | --- |")
-    for (env, way), successes in cells.items():
-        low, high = wilson_interval(int(sum(successes)), len(successes))
-        print(f"| {env} | {way} | {np.mean(successes):.1%} | {low:.1%} to {high:.1%} | {len(successes)} |")
+        for key, values in cells[row["env"], row["way"]].items():
+            values += row[key] or []
+    print("| task | acting | success or mean return | 95 % interval, or standard deviation | episodes |")
+    print("| --- | --- | --- | --- | --- |")
+    for (env, way), values in cells.items():
+        returns, successes = values["returns"], values["successes"]
+        if successes:
+            low, high = wilson_interval(int(sum(successes)), len(successes))
+            result = f"{np.mean(successes):.1%} | {low:.1%} to {high:.1%}"
+        else:
+            result = f"{np.mean(returns):,.0f} | {np.std(returns):,.0f}"
+        print(f"| {env} | {way} | {result} | {len(returns)} |")
 
 
 def main() -> None:
@@ -71,6 +85,7 @@ def main() -> None:
     parser.add_argument("--n-envs", type=int, default=10)
     parser.add_argument("--seed", type=int, default=1000, help="of the first initial state")
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
+    parser.add_argument("--noise-std", type=float, nargs="+", help="of deterministic acting; the model's own by default")
     parser.add_argument("--report", nargs="+", metavar="FILE")
     options = parser.parse_args()
     if options.report:
