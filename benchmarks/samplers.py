@@ -45,12 +45,12 @@ def evaluate_ways(options: argparse.Namespace) -> None:
     vec_env = DummyVecEnv([lambda: make_env(options.env, options.target_return)] * options.n_envs)
     model = DTFM.load(options.model, device="cpu")
     seeds = range(options.seed, options.seed + options.episodes)
-    deviations = options.noise_std or [model.policy.deterministic_noise_std]
-    for way, deviation in product(options.ways, deviations):
+    noise = model.policy.noise_table.clone()
+    for way, deviation in product(options.ways, options.noise_std):
         solver, n_solver_steps, kv_cache = WAYS[way]
         model.policy.set_solver(solver, n_solver_steps)
         model.policy.kv_cache = kv_cache
-        model.policy.deterministic_noise_std = deviation
+        model.policy.noise_table.copy_(deviation * noise)
         with tqdm(total=options.episodes, unit="episode", leave=False) as progress:
             episodes = evaluate(model, vec_env, seeds, lambda n_done, bar=progress: bar.update(n_done - bar.n))
         name = f"{way}, noise {deviation:g}"
@@ -85,7 +85,7 @@ def main() -> None:
     parser.add_argument("--n-envs", type=int, default=10)
     parser.add_argument("--seed", type=int, default=1000, help="of the first initial state")
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
-    parser.add_argument("--noise-std", type=float, nargs="+", help="of deterministic acting; the model's own by default")
+    parser.add_argument("--noise-std", type=float, nargs="+", default=[1.0], help="of deterministic acting")
     parser.add_argument("--report", nargs="+", metavar="FILE")
     options = parser.parse_args()
     if options.report:

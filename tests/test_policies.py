@@ -148,15 +148,6 @@ def test_episodes_that_start_elsewhere_have_another_deterministic_noise(cheetah_
     assert th.equal(model.policy.noise_table.roll(-row - 1, 0)[:2], th.stack([drawn[1][2], drawn[2][2]]))
 
 
-def test_deterministic_noise_has_the_asked_deviation_and_fresh_noise_always_one(cheetah_buffer):
-    model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=TINY_FLOW_POLICY, seed=0)
-    timesteps = th.arange(1000)
-    model.policy.deterministic_noise_std = 0.25
-    for deterministic, deviation in ((True, 0.25), (False, 1.0)):
-        noise = model.policy._acting_noise(timesteps, th.zeros_like(timesteps), deterministic)
-        assert noise.std().item() == pytest.approx(deviation, rel=0.05)
-
-
 def test_normalisation_is_the_datasets(model, cheetah_buffer):
     observations = cheetah_buffer.observations.numpy()
     assert np.allclose(model.policy.observation_mean, observations.mean(0), atol=1e-4)
@@ -302,11 +293,9 @@ def test_a_way_of_acting_that_was_chosen_after_training_is_saved(cheetah_buffer,
     model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=TINY_FLOW_POLICY, seed=0)
     model.policy.set_solver("heun", 3)
     model.policy.kv_cache = True
-    model.policy.deterministic_noise_std = 0.5
     model.save(tmp_path / "model.zip")
     loaded = DTFM.load(tmp_path / "model.zip")
     assert (loaded.policy.solver, loaded.policy.n_solver_steps, loaded.policy.kv_cache) == ("heun", 3, True)
-    assert loaded.policy.deterministic_noise_std == 0.5
     assert np.array_equal(roll_plain(model, 8), roll_plain(loaded, 8))
 
 

@@ -30,8 +30,6 @@ class DTFMPolicy(SequencePolicy):
     :param n_flow_draws: pairs of noise and tau for each hidden state and gradient step: the head is cheap beside the trunk
     :param solver: how to act: an ODE solver, euler, midpoint, heun or rk4; or one_step, the network that learnt its end
     :param n_solver_steps: steps of the ODE solver
-    :param deterministic_noise_std: standard deviation of the noise that `deterministic=True` starts from. 1 is what was
-        learned from: actions as varied as the data's. Less keeps nearer to the middle of each mode
     :param one_step: train that network; a few percent of a gradient step, no influence on the rest
     :param regression_coef: weight of the auxiliary action regression; 0 leaves it out
 
@@ -49,7 +47,6 @@ class DTFMPolicy(SequencePolicy):
         n_flow_draws: int = 1,
         solver: str = "euler",
         n_solver_steps: int = 50,
-        deterministic_noise_std: float = 1.0,
         one_step: bool = True,
         regression_coef: float = 0.0,
         **kwargs: Any,
@@ -62,7 +59,6 @@ class DTFMPolicy(SequencePolicy):
         self.n_flow_draws = n_flow_draws
         self.solver = solver
         self.n_solver_steps = n_solver_steps
-        self.deterministic_noise_std = deterministic_noise_std
         self.one_step = one_step
         self.regression_coef = regression_coef
         super().__init__(*args, **kwargs)
@@ -135,7 +131,7 @@ class DTFMPolicy(SequencePolicy):
 
     def _acting_noise(self, timestep: th.Tensor, episode_key: th.Tensor, deterministic: bool) -> th.Tensor:
         if deterministic:
-            return self.deterministic_noise_std * self.noise_table[(timestep + episode_key) % NOISE_ROWS]
+            return self.noise_table[(timestep + episode_key) % NOISE_ROWS]
         if self._acting_generator is None:
             self._acting_generator = th.Generator(self.device)
             if self.seed is None:
@@ -145,8 +141,7 @@ class DTFMPolicy(SequencePolicy):
         return standard_normal(len(timestep), self.action_dim, self._acting_generator)
 
     def _acting_settings(self) -> dict[str, Any]:
-        names = ("solver", "n_solver_steps", "deterministic_noise_std")
-        return {**super()._acting_settings(), **{name: getattr(self, name) for name in names}}
+        return {**super()._acting_settings(), "solver": self.solver, "n_solver_steps": self.n_solver_steps}
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         names = ("flow_hidden_dim", "flow_n_layers", "flow_prediction", "n_flow_draws", "one_step", "regression_coef")

@@ -26,7 +26,6 @@ HEAD_KEYS = {
     "solver",
     "n_solver_steps",
     "one_step",
-    "deterministic_noise_std",
 }
 SETTINGS = [None, "small"]
 
