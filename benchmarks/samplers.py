@@ -51,7 +51,7 @@ def evaluate_ways(options: argparse.Namespace) -> None:
         model.policy.set_solver(solver, n_solver_steps)
         model.policy.kv_cache = kv_cache
         model.policy.noise_table.copy_(deviation * noise)
-        with tqdm(total=options.episodes, unit="episode", leave=False) as progress:
+        with tqdm(total=options.episodes, unit="episode", leave=False, disable=None) as progress:
             episodes = evaluate(model, vec_env, seeds, lambda n_done, bar=progress: bar.update(n_done - bar.n))
         name = f"{way}, noise {deviation:g}"
         print(json.dumps({"env": options.env, "model": options.model, "way": name, **episodes._asdict()}), flush=True)

@@ -204,6 +204,19 @@ def logged_learning_rates(model, n_steps):
     return rates
 
 
+def test_several_flow_draws_and_action_prediction_train_and_are_saved(cheetah_buffer, tmp_path):
+    policy_kwargs = {**TINY_FLOW_POLICY, "n_flow_draws": 3, "flow_prediction": "action"}
+    model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, context_length=3, policy_kwargs=policy_kwargs, seed=0)
+    batch = model.buffer.sample(4, 3, th.Generator().manual_seed(0))
+    noise, tau = model.policy.draw_noise(batch, th.Generator().manual_seed(0))
+    assert (noise.shape, tau.shape) == ((4, 3, 3, 6), (4, 3, 3))
+    model.learn(3).save(tmp_path / "model")
+    policy = DTFM.load(tmp_path / "model").policy
+    assert (policy.n_flow_draws, policy.network.head.prediction) == (3, "action")
+    with pytest.raises(ValueError, match="n_flow_draws must be at least 1, got 0"):
+        DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs={**TINY_FLOW_POLICY, "n_flow_draws": 0})
+
+
 def test_learning_rate_warms_up_and_decays(cheetah_buffer):
     rates = logged_learning_rates(
         make_model(DT, cheetah_buffer, learning_rate=1.0e-3, warmup_steps=4, learning_rate_schedule="linear"), 10

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from typing import Any
 
-from sb3_dtfm.benchmark.runs import ALGORITHMS, Group, Run
+from sb3_dtfm.benchmark.runs import Group, Run
 
-# Settings that the grid gives each cell, and the seed that RL-Zoo adds.
+# Settings that tell cells apart, not labels.
 NOT_A_CHANGE = ("dataset", "dataset_fraction", "dataset_seed")
 
 
@@ -60,13 +60,7 @@ def compared_cells(base: Group, changed: Group) -> list[tuple[str, float, str, l
 
     :return: task, share of the data, algorithm, the labelled runs, and the others with the same seeds
     """
-    cells = []
-    for task in changed.tasks:
-        for regime in changed.regimes:
-            for algo in ALGORITHMS:
-                runs = changed.of(task, regime, algo)
-                seeds = {run.cell.seed for run in runs}
-                same = [run for run in base.of(task, regime, algo) if run.cell.seed in seeds]
-                if runs:
-                    cells.append((task, regime, algo, runs, same))
-    return cells
+    return [
+        (*key, runs, [run for run in base.of(*key) if run.cell.seed in {each.cell.seed for each in runs}])
+        for key, runs in sorted(changed.runs.items(), key=lambda item: item[0])
+    ]
