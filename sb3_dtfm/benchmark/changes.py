@@ -13,14 +13,16 @@ def split_changes(groups: Sequence[Group]) -> tuple[list[Group], list[tuple[Grou
     """
     Groups that stand for themselves, and those to be compared with the same profile without a label.
 
+    A label that was run for both algorithms, on other data perhaps, compares them anew; for one, it changes a setting.
+
     :return: the former; and each group without a label, with its labelled ones if it has any
     """
     plain = {group.profile: group for group in groups if not group.label}
-    alone = [group for group in groups if not group.label or group.profile not in plain]
+    alone = [group for group in groups if not group.label or group.compares or group.profile not in plain]
     changed = [
         (base, labelled)
         for base in plain.values()
-        if (labelled := [group for group in groups if group.label and group.profile == base.profile])
+        if (labelled := [group for group in groups if group not in alone and group.profile == base.profile])
     ]
     return alone, changed
 

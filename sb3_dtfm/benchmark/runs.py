@@ -94,8 +94,14 @@ class Group(NamedTuple):
 
     @property
     def regimes(self) -> list[float]:
-        """Shares of the data, the paper's and those run, largest first."""
-        return sorted({*PAPER_REGIMES, *(regime for _, regime, _ in self.runs)}, reverse=True)
+        """Shares of the data, the paper's (unless something was changed) and those run, largest first."""
+        paper = () if self.label else PAPER_REGIMES
+        return sorted({*paper, *(regime for _, regime, _ in self.runs)}, reverse=True)
+
+    @property
+    def compares(self) -> bool:
+        """Whether both algorithms were run."""
+        return {algo for _, _, algo in self.runs} == set(ALGORITHMS)
 
     def of(self, task: str, regime: float, algo: str) -> list[Run]:
         """Runs of one cell, none if it was not run."""

@@ -182,7 +182,7 @@ class TrajectoryBuffer:
 
     def return_to_go_range(self) -> th.Tensor:
         """
-        Smallest and largest return-to-go at each time step, over the buffer's own episodes.
+        Smallest and largest return-to-go at each time step, over the buffer's own episodes; reads 4 bytes a step.
 
         :return: (2, T) of the T steps of the longest episode, environment reward units
         """

@@ -59,12 +59,13 @@ def record_demonstrations(
     n_workers: int | None = None,
     overwrite: bool = False,
     progress: bool = True,
+    noise: float = 0.0,
 ) -> RecordingSummary:
     """
     Let a scripted demonstrator do a task until it has succeeded `n_episodes` times, and write those episodes.
 
-    The file depends on `task`, `n_episodes` and `seed` only: attempt i draws everything from (seed, i), and the first
-    successes in the order of attempts are kept, whatever the number of workers.
+    The file depends on `task`, `n_episodes`, `seed` and `noise` only: attempt i draws everything from (seed, i), and the
+    first successes in the order of attempts are kept, whatever the number of workers.
 
     :param task: "lift" or "can"
     :param n_episodes: successful episodes to record
@@ -73,12 +74,16 @@ def record_demonstrations(
     :param n_workers: processes to simulate in; the number of CPU cores by default, and 1 stays in this process
     :param overwrite: replace an existing file
     :param progress: show a progress bar with the success rate
+    :param noise: standard deviation of Gaussian noise on the actions, as a share of the action range (2); the sum is
+        clipped into the action space, and what is recorded is what was executed
     :raises FileExistsError: `output` exists and is not to be overwritten
     """
     if task not in TASKS:
         raise ValueError(f"task must be one of {', '.join(map(repr, TASKS))}, got {task!r}.")
     if n_episodes < 1:
         raise ValueError(f"n_episodes must be at least 1, got {n_episodes}.")
+    if not 0.0 <= noise < np.inf:
+        raise ValueError(f"noise must be a share of the action range, 0 or more, got {noise}.")
     refuse_existing(Path(output), overwrite)
     start = time.monotonic()
     n_workers = min(n_workers or _n_cores(), n_episodes)
@@ -88,7 +93,7 @@ def record_demonstrations(
     limit = n_episodes * ATTEMPTS_PER_EPISODE + 10
     with (
         RobomimicWriter(output, env.env_args, overwrite, seed) as writer,
-        closing(_attempts(task, seed, n_workers, limit)) as attempts,
+        closing(_attempts((task, seed, noise), n_workers, limit)) as attempts,
     ):
         with tqdm(total=n_episodes, desc=f"Recording {task}", unit="episode", disable=not progress) as bar:
             for episode in attempts:
@@ -111,10 +116,12 @@ def _n_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _attempts(task: str, seed: int, n_workers: int, limit: int) -> Generator[RecordedEpisode | None, None, None]:
-    """Episodes in the order of attempts, None for a failed one."""
+def _attempts(
+    recording: tuple[str, int, float], n_workers: int, limit: int
+) -> Generator[RecordedEpisode | None, None, None]:
+    """Episodes of a task, seed and noise in the order of attempts, None for a failed one."""
     if n_workers == 1:
-        yield from (_attempt(task, seed, attempt) for attempt in range(limit))
+        yield from (_attempt(*recording, attempt) for attempt in range(limit))
         return
     # Linux forks: the workers then share what is imported already, and scripts need no __main__ guard.
     context = multiprocessing.get_context("fork" if sys.platform == "linux" else None)
@@ -122,7 +129,7 @@ def _attempts(task: str, seed: int, n_workers: int, limit: int) -> Generator[Rec
     pending: deque[Future[RecordedEpisode | None]] = deque()
     try:
         for attempt in range(limit):
-            pending.append(executor.submit(_attempt, task, seed, attempt))
+            pending.append(executor.submit(_attempt, *recording, attempt))
             if len(pending) > 2 * n_workers:
                 yield pending.popleft().result()
         while pending:
@@ -140,16 +147,19 @@ def _environment(task: str) -> RobosuiteEnv:
     return _environments[task]
 
 
-def _attempt(task: str, seed: int, attempt: int) -> RecordedEpisode | None:
+def _attempt(task: str, seed: int, noise: float, attempt: int) -> RecordedEpisode | None:
     """One episode, None if it does not succeed."""
     env = _environment(task)
-    env_seed, demonstrator_seed = np.random.SeedSequence((seed, attempt)).generate_state(2)
+    env_seed, demonstrator_seed, noise_seed = np.random.SeedSequence((seed, attempt)).generate_state(3)
+    space, noise_rng = env.action_space, np.random.default_rng(int(noise_seed))
+    scale = noise * (space.high - space.low)
     demonstrator = DEMONSTRATORS[TASKS[task]](int(demonstrator_seed))
     observation, _ = env.reset(seed=int(env_seed))
     observations, actions, states = [observation], [], []
     terminated = truncated = False
     while not (terminated or truncated):
-        actions.append(demonstrator.act(observation))
+        action = demonstrator.act(observation) + scale * noise_rng.standard_normal(space.shape)
+        actions.append(np.clip(action, space.low, space.high).astype(space.dtype))
         states.append(env.state)
         observation, _, terminated, truncated, _ = env.step(actions[-1])
         observations.append(observation)

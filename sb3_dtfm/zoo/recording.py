@@ -18,7 +18,6 @@ AGENT_OPTIONS: dict[str, tuple[bool, dict]] = {
     "env": (True, {"metavar": "ENV", "help": "Gymnasium environment id"}),
     "dataset_id": (True, {"metavar": "ID", "help": "Minari id to write, e.g. local/halfcheetah/expert-v0"}),
     "stochastic": (False, {"action": "store_true", "help": "draw actions instead of taking the best"}),
-    "noise": (False, {"type": float, "metavar": "STD", "help": "Gaussian action noise, as a share of the action range"}),
     "n_envs": (False, {"type": int, "metavar": "N", "help": "environments side by side"}),
 }
 DEMONSTRATOR_OPTIONS: dict[str, tuple[bool, dict]] = {
@@ -37,6 +36,7 @@ def record_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--episodes", type=int, required=True, metavar="N", help="episodes to keep")
     parser.add_argument("--seed", type=int, default=0, help="0 by default")
+    parser.add_argument("--noise", type=float, default=0.0, metavar="STD", help="Gaussian action noise, share of the range")
     parser.add_argument("--overwrite", action="store_true", help="replace a dataset that is there already")
     agent = parser.add_argument_group("a trained agent")
     demonstrator = parser.add_argument_group("a scripted demonstrator")
@@ -68,7 +68,7 @@ def record(argv: Sequence[str]) -> None:
 def _record_agent(options: argparse.Namespace) -> None:
     from sb3_dtfm.data.record_agent import record_agent
 
-    optional = {name: value for name in ("noise", "n_envs") if (value := getattr(options, name)) is not None}
+    optional = {} if options.n_envs is None else {"n_envs": options.n_envs}
     dataset = record_agent(
         options.algo,
         options.model,
@@ -76,6 +76,7 @@ def _record_agent(options: argparse.Namespace) -> None:
         options.episodes,
         options.dataset_id,
         deterministic=not options.stochastic,
+        noise=options.noise,
         seed=options.seed,
         overwrite=options.overwrite,
         **optional,
@@ -90,6 +91,7 @@ def _record_demonstrations(options: argparse.Namespace) -> None:
         options.demonstrator,
         options.episodes,
         options.output,
+        noise=options.noise,
         seed=options.seed,
         n_workers=options.workers,
         overwrite=options.overwrite,

@@ -149,6 +149,20 @@ def test_recorded_actions_replay_to_the_recorded_observations(recording, lift):
             assert terminated
 
 
+def test_noise_has_the_stated_size_and_is_recorded(tmp_path):
+    path = tmp_path / "noisy.hdf5"
+    summary = record_demonstrations("lift", 2, path, seed=3, n_workers=1, progress=False, noise=0.05)
+    assert summary.success_rate == 1.0  # so that the second episode is the second attempt
+    buffer = load_robomimic(path)
+    rows = slice(buffer.episode_lengths[0], None)
+    demonstrator = LiftDemonstrator(int(np.random.SeedSequence((3, 1)).generate_state(2)[1]))
+    own = np.stack([demonstrator.act(observation) for observation in buffer.observations[rows].numpy()])
+    recorded = buffer.actions[rows].numpy()
+    inside = np.abs(recorded) < 1.0
+    assert np.std((recorded - own)[inside]) == pytest.approx(0.1, rel=0.15)
+    assert np.abs(recorded).max() <= 1.0
+
+
 def test_existing_recording_is_kept_unless_told_otherwise(recording):
     path, _ = recording
     before = path.read_bytes()
@@ -166,8 +180,12 @@ def test_failed_recording_leaves_nothing(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [(("stack", 1), "task must be one of 'lift', 'can', got 'stack'"), (("lift", 0), "n_episodes must be at least 1")],
+    [
+        ({"task": "stack"}, "task must be one of 'lift', 'can', got 'stack'"),
+        ({"n_episodes": 0}, "n_episodes must be at least 1"),
+        ({"noise": -0.1}, "noise must be a share of the action range, 0 or more, got -0.1"),
+    ],
 )
 def test_wrong_arguments_are_named(arguments, message, tmp_path):
     with pytest.raises(ValueError, match=message):
-        record_demonstrations(*arguments, tmp_path / "out.hdf5")
+        record_demonstrations(**{"task": "lift", "n_episodes": 1, "output": tmp_path / "out.hdf5", **arguments})

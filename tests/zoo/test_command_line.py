@@ -125,8 +125,8 @@ def test_an_error_in_the_midst_of_training_keeps_its_traceback(workplace, monkey
         (["--algo", "sac"], "--model, --env, --dataset-id: required without --demonstrator"),
         (["--demonstrator", "lift"], "--output: required with --demonstrator lift"),
         (
-            ["--demonstrator", "lift", "--output", "x", "--stochastic", "--noise", "1"],
-            "--stochastic, --noise: not used with",
+            ["--demonstrator", "lift", "--output", "x", "--stochastic", "--n-envs", "1"],
+            "--stochastic, --n-envs: not used with",
         ),
         (
             ["--algo", "sac", "--model", "m", "--env", "E", "--dataset-id", "i", "--workers", "1"],
