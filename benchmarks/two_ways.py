@@ -1,0 +1,130 @@
+"""
+Two ways to a goal, equally good: demonstrations with two modes, and where trained models go.
+
+A ball has to get round a block, to the left or to the right. The script that demonstrates it tosses a coin, whatever the
+ball's position, so the same observation is followed by two actions; their mean leads into the block.
+
+    python benchmarks/two_ways.py record
+    sb3-dtfm benchmark $(python benchmarks/two_ways.py arguments) --seeds 0 1 2
+    python benchmarks/two_ways.py plot --dt dt.zip --dtfm dtfm.zip --output docs/two-ways.png
+"""
+
+import argparse
+from pathlib import Path
+
+import gymnasium as gym
+import minari
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_dtfm import DT, DTFM
+from sb3_dtfm.data.record_agent import check_dataset_id, write_dataset
+from sb3_dtfm.data.rollout import run_episodes
+from sb3_dtfm.envs import ReturnToGoWrapper
+
+ENV_ID = "PointMaze_UMaze-v3"
+ENV_KWARGS = {
+    "maze_map": [[1, 1, 1, 1, 1], [1, 0, "g", 0, 1], [1, 0, 1, 0, 1], [1, 0, "r", 0, 1], [1, 1, 1, 1, 1]],
+    "continuing_task": False,
+    "max_episode_steps": 150,
+}
+DATASET_ID = "local/pointmaze/two-ways-v0"
+WAYPOINTS = [(1, -1), (1, 0), (1, 1)]  # cells to the right and up from the block; the left way is their mirror image
+GAIN, DAMPING = 4.0, 0.5  # of the controller, action units per metre and per metre/second
+FIRST_STATE = 2_000_000  # seed of the first initial state to plot: those of the benchmark's final evaluation
+NEAR = 0.35  # metres from a way-point at which the next one is headed for
+
+
+class Demonstrator:
+    """Follows way-points to the goal on the side that a coin decides."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        side = rng.choice((-1, 1))
+        self._targets = [np.array([side * x, y], float) for x, y in WAYPOINTS]
+
+    def act(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        position, velocity = observation["observation"][:2], observation["observation"][2:]
+        while self._targets and np.linalg.norm(self._targets[0] - position) < NEAR:
+            self._targets.pop(0)
+        target = self._targets[0] if self._targets else observation["desired_goal"]
+        wanted = GAIN * (target - position) - DAMPING * velocity + self._rng.normal(0.0, 0.1, 2)
+        return np.clip(wanted, -1.0, 1.0).astype(np.float32)
+
+
+def record(n_episodes: int) -> None:
+    """Write the dataset."""
+    check_dataset_id(DATASET_ID, overwrite=True)
+    env = gym.make(ENV_ID, **ENV_KWARGS)
+    demonstrators = [Demonstrator(np.random.default_rng(number)) for number in range(n_episodes)]
+
+    def act(observations: dict[str, np.ndarray], _: np.ndarray, numbers: list[int]) -> np.ndarray:
+        return np.stack([demonstrators[n].act({k: v[i] for k, v in observations.items()}) for i, n in enumerate(numbers)])
+
+    metadata = {"algorithm_name": "way-points, left or right at random"}
+    dataset = write_dataset(DATASET_ID, run_episodes([env], act, n_episodes, seed=0), env, metadata)
+    episodes = list(dataset.iterate_episodes())
+    reached = np.mean([episode.terminations[-1] for episode in episodes])
+    print(f"{dataset.id}: {n_episodes} episodes, {reached:.0%} reach the goal, {dataset.total_steps} steps")
+
+
+def model_paths(model: BaseAlgorithm, n_episodes: int) -> list[np.ndarray]:
+    """Positions (T + 1, 2) of the ball in each episode, in metres; acting deterministically."""
+    env = ReturnToGoWrapper(gym.make(ENV_ID, **ENV_KWARGS), target_return=1.0)
+    paths = []
+    for seed in range(FIRST_STATE, FIRST_STATE + n_episodes):
+        observation, _ = env.reset(seed=seed)
+        state, start, over, path = None, np.ones(1, bool), False, []
+        while not over:
+            path.append(observation["observation"][:2])
+            action, state = model.predict(observation, state, start, deterministic=True)
+            observation, _, terminated, truncated, _ = env.step(action)
+            over, start = terminated or truncated, np.zeros(1, bool)
+        paths.append(np.array([*path, observation["observation"][:2]]))
+    return paths
+
+
+def plot(models: dict[str, BaseAlgorithm], n_episodes: int, output: Path) -> None:
+    """Draw the ways of demonstrations and models, those that did not arrive in red."""
+    dataset = minari.load_dataset(DATASET_ID)
+    demonstrated = [episode.observations["achieved_goal"] for episode in dataset.iterate_episodes(range(n_episodes))]
+    panels = {"demonstrations": demonstrated, **{name: model_paths(model, n_episodes) for name, model in models.items()}}
+    figure = Figure(figsize=(3.0 * len(panels), 3.3), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axis, (name, paths) in zip(figure.subplots(1, len(panels)), panels.items(), strict=True):
+        arrived = [len(path) <= ENV_KWARGS["max_episode_steps"] for path in paths]
+        for path, there in sorted(zip(paths, arrived, strict=True), key=lambda each: not each[1]):
+            axis.plot(*path.T, color="#0072B2" if there else "#D55E00", linewidth=0.9, alpha=0.7, zorder=3 - there)
+        axis.add_patch(Rectangle((-0.5, -0.5), 1, 1, color="0.75"))
+        axis.add_patch(Rectangle((-1.5, -1.5), 3, 3, fill=False, color="0.75", linewidth=6))
+        for cell, place in (((0, -1.42), "start"), ((0, 1.3), "goal")):
+            axis.text(*cell, place, ha="center", color="0.45")
+        axis.set(title=f"{name}: {sum(arrived)} of {len(paths)} arrive", xticks=[], yticks=[], aspect="equal")
+        axis.set_frame_on(False)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(output, dpi=150)
+    print(output)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("record", "arguments", "plot"))
+    parser.add_argument("--episodes", type=int, help="200 to record, 50 to plot by default")
+    parser.add_argument("--dt", type=Path, help="a trained DT")
+    parser.add_argument("--dtfm", type=Path, help="a trained DTFM")
+    parser.add_argument("--output", type=Path, default=Path("docs/two-ways.png"))
+    options = parser.parse_args()
+    if options.what == "record":
+        record(options.episodes or 200)
+    elif options.what == "plot":
+        plot({"DT": DT.load(options.dt), "DTFM": DTFM.load(options.dtfm)}, options.episodes or 50, options.output)
+    else:
+        kwargs = " ".join(f"{key}:{value!r}".replace(" ", "") for key, value in ENV_KWARGS.items())
+        print(f"--dataset {ENV_ID}={DATASET_ID} --target-return 1 --fractions 1.0 --env-kwargs {kwargs} --label two-ways")
+
+
+if __name__ == "__main__":
+    main()
