@@ -122,8 +122,9 @@ def main() -> None:
     elif options.what == "plot":
         plot({"DT": DT.load(options.dt), "DTFM": DTFM.load(options.dtfm)}, options.episodes or 50, options.output)
     else:
-        kwargs = " ".join(f"{key}:{value!r}".replace(" ", "") for key, value in ENV_KWARGS.items())
-        print(f"--dataset {ENV_ID}={DATASET_ID} --target-return 1 --fractions 1.0 --env-kwargs {kwargs} --label two-ways")
+        env_kwargs = [f"{key}:{value!r}".replace(" ", "") for key, value in ENV_KWARGS.items()]
+        data = ["--dataset", f"{ENV_ID}={DATASET_ID}", "--target-return", "1", "--fractions", "1.0"]
+        print(*data, "-n", "1000", "--label", "two-ways", "--env-kwargs", *env_kwargs)
 
 
 if __name__ == "__main__":
