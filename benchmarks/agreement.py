@@ -1,0 +1,57 @@
+"""
+How near trained models' actions are to those of the agent that was recorded, had it not drawn them at random.
+
+    python benchmarks/agreement.py Walker2d-v5.zip ... --agent ppo-Walker2d-v5.zip --agent-algo ppo \\
+        --dataset local/walker2d/expert-v0 --fraction 0.5
+
+Models are told apart by `/dt/` and `/dtfm/` in their paths, where `sb3-dtfm train` and `benchmark` put them. Prints the root
+mean square of the difference, in units of [-1, 1], at the last step of windows: of episodes learned from, and of the others.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch as th
+
+from sb3_dtfm.data import TrajectoryBuffer, load_dataset
+from sb3_dtfm.data.record_agent import load_agent
+from sb3_dtfm.zoo.registration import OFFLINE_ALGORITHMS
+
+N_WINDOWS = 4096
+
+
+def split(buffer: TrajectoryBuffer, fraction: float, seed: int) -> dict[str, TrajectoryBuffer]:
+    """The episodes that `dataset_fraction` and `dataset_seed` choose, and those that they leave out."""
+    learned = buffer.random_fraction(fraction, seed)
+    others = np.flatnonzero(~np.isin(buffer.episodes.starts, learned.episodes.starts))
+    return {"learned": learned} | ({"held out": buffer.select(others)} if len(others) else {})
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("models", nargs="+", type=Path)
+    parser.add_argument("--agent", required=True)
+    parser.add_argument("--agent-algo", required=True)
+    parser.add_argument("--dataset", required=True)
+    parser.add_argument("--fraction", type=float, default=1.0)
+    parser.add_argument("--dataset-seed", type=int, default=0)
+    options = parser.parse_args()
+    agent = load_agent(options.agent_algo, options.agent, "cpu")
+    parts = split(load_dataset(options.dataset), options.fraction, options.dataset_seed)
+    for path in options.models:
+        model = OFFLINE_ALGORITHMS[next(part for part in path.parts if part in OFFLINE_ALGORITHMS)].load(path, device="cpu")
+        policy = model.policy
+        for name, buffer in parts.items():
+            batch = buffer.sample(N_WINDOWS, policy.context_length, th.Generator().manual_seed(0))
+            wanted, _ = agent.predict(batch.observations[:, -1].numpy(), deterministic=True)
+            generator = th.Generator().manual_seed(0)
+            errors = {}
+            for whose, actions in (("the agent's", th.as_tensor(wanted)), ("the recorded", batch.actions[:, -1])):
+                target = batch._replace(actions=th.cat((batch.actions[:, :-1], actions.unsqueeze(1)), dim=1))
+                errors[whose] = policy.action_mse(target, generator) ** 0.5
+            print(f"{path}: {name}: " + ", ".join(f"{error:.4f} from {whose}" for whose, error in errors.items()))
+
+
+if __name__ == "__main__":
+    main()
