@@ -99,6 +99,7 @@ class Demonstrator:
     A grasp that closes on nothing, or an object lost on the way, leads back to the hover point.
 
     :param seed: of everything random; the same seed and observations give the same actions
+    :param pause: steps that the hand rests before it closes, on average: people hesitate, and nothing tells for how long
     """
 
     object_columns = slice(9, 12)  # where the observation holds the object's position
@@ -108,8 +109,9 @@ class Demonstrator:
     speed_range = (0.35, 0.7)
     free_stages = ("hover", "descend")  # where a jerk does no harm
 
-    def __init__(self, seed: int | np.random.SeedSequence | None = None) -> None:
+    def __init__(self, seed: int | np.random.SeedSequence | None = None, pause: float = 0.0) -> None:
         self._rng = np.random.default_rng(seed)
+        self._pause = pause
         self.reset()
 
     def reset(self) -> None:
@@ -153,11 +155,13 @@ class Demonstrator:
             if aside > 0.04:
                 return "hover"
             if aside < GRASP_TOLERANCE and -to_grasp[2] < manner.grasp_height_tolerance:
-                return "grasp"
+                return "pause" if self._pause > 0.0 else "grasp"
+        if self.stage == "pause":  # as likely to end at any step: a geometric number of them
+            return "pause" if self._rng.random() < self._pause / (self._pause + 1.0) else "grasp"
         if self.stage == "grasp" and self._steps_in_stage >= 3 + manner.dwell and finger_speed < FINGERS_STILL:
             self._misjudged_height = 0.0
             return self._after_grasp() if fingers > self.smallest_grip else "hover"
-        if self.stage not in ("hover", "descend", "grasp"):
+        if self.stage not in ("hover", "descend", "pause", "grasp"):
             return self._next_stage_holding(hand, position, fingers)
         return self.stage
 
@@ -173,8 +177,8 @@ class Demonstrator:
             # Through a funnel: the further aside, the higher, so that the fingers come down beside the object, not on it.
             height = FUNNEL_SLOPE * max(aside - FUNNEL_RADIUS, 0.0) - OVERREACH
             return grasp_point + np.array([0.0, 0.0, height]), OPEN
-        if self.stage == "grasp":
-            return grasp_point, CLOSE
+        if self.stage in ("pause", "grasp"):
+            return grasp_point, OPEN if self.stage == "pause" else CLOSE
         return self._target_holding(hand, position)
 
     def _grasp_point(self, position: np.ndarray) -> np.ndarray:

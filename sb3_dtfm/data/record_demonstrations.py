@@ -60,12 +60,13 @@ def record_demonstrations(
     overwrite: bool = False,
     progress: bool = True,
     noise: float = 0.0,
+    pause: float = 0.0,
 ) -> RecordingSummary:
     """
     Let a scripted demonstrator do a task until it has succeeded `n_episodes` times, and write those episodes.
 
-    The file depends on `task`, `n_episodes`, `seed` and `noise` only: attempt i draws everything from (seed, i), and the
-    first successes in the order of attempts are kept, whatever the number of workers.
+    The file depends on the task, the number of episodes, seed, noise and pause only: attempt i draws everything from
+    (seed, i), and the first successes in the order of attempts are kept, whatever the number of workers.
 
     :param task: "lift" or "can"
     :param n_episodes: successful episodes to record
@@ -76,6 +77,7 @@ def record_demonstrations(
     :param progress: show a progress bar with the success rate
     :param noise: standard deviation of Gaussian noise on the actions, as a share of the action range (2); the sum is
         clipped into the action space, and what is recorded is what was executed
+    :param pause: steps that the hand rests before it closes, on average; geometrically distributed
     :raises FileExistsError: `output` exists and is not to be overwritten
     """
     if task not in TASKS:
@@ -84,6 +86,8 @@ def record_demonstrations(
         raise ValueError(f"n_episodes must be at least 1, got {n_episodes}.")
     if not 0.0 <= noise < np.inf:
         raise ValueError(f"noise must be a share of the action range, 0 or more, got {noise}.")
+    if not 0.0 <= pause < np.inf:
+        raise ValueError(f"pause must be a number of steps, 0 or more, got {pause}.")
     refuse_existing(Path(output), overwrite)
     start = time.monotonic()
     n_workers = min(n_workers or _n_cores(), n_episodes)
@@ -93,7 +97,7 @@ def record_demonstrations(
     limit = n_episodes * ATTEMPTS_PER_EPISODE + 10
     with (
         RobomimicWriter(output, env.env_args, overwrite, seed) as writer,
-        closing(_attempts((task, seed, noise), n_workers, limit)) as attempts,
+        closing(_attempts((task, seed, noise, pause), n_workers, limit)) as attempts,
     ):
         with tqdm(total=n_episodes, desc=f"Recording {task}", unit="episode", disable=not progress) as bar:
             for episode in attempts:
@@ -117,9 +121,9 @@ def _n_cores() -> int:
 
 
 def _attempts(
-    recording: tuple[str, int, float], n_workers: int, limit: int
+    recording: tuple[str, int, float, float], n_workers: int, limit: int
 ) -> Generator[RecordedEpisode | None, None, None]:
-    """Episodes of a task, seed and noise in the order of attempts, None for a failed one."""
+    """Episodes of a task, seed, noise and pause in the order of attempts, None for a failed one."""
     if n_workers == 1:
         yield from (_attempt(*recording, attempt) for attempt in range(limit))
         return
@@ -147,13 +151,13 @@ def _environment(task: str) -> RobosuiteEnv:
     return _environments[task]
 
 
-def _attempt(task: str, seed: int, noise: float, attempt: int) -> RecordedEpisode | None:
+def _attempt(task: str, seed: int, noise: float, pause: float, attempt: int) -> RecordedEpisode | None:
     """One episode, None if it does not succeed."""
     env = _environment(task)
     env_seed, demonstrator_seed, noise_seed = np.random.SeedSequence((seed, attempt)).generate_state(3)
     space, noise_rng = env.action_space, np.random.default_rng(int(noise_seed))
     scale = noise * (space.high - space.low)
-    demonstrator = DEMONSTRATORS[TASKS[task]](int(demonstrator_seed))
+    demonstrator = DEMONSTRATORS[TASKS[task]](int(demonstrator_seed), pause)
     observation, _ = env.reset(seed=int(env_seed))
     observations, actions, states = [observation], [], []
     terminated = truncated = False

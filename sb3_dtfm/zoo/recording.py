@@ -22,6 +22,7 @@ AGENT_OPTIONS: dict[str, tuple[bool, dict]] = {
 }
 DEMONSTRATOR_OPTIONS: dict[str, tuple[bool, dict]] = {
     "output": (True, {"metavar": "FILE", "help": "robomimic hdf5 file to write"}),
+    "pause": (False, {"type": float, "metavar": "STEPS", "help": "mean time that the hand rests before it closes"}),
     "workers": (False, {"type": int, "metavar": "N", "help": "processes side by side"}),
 }
 
@@ -92,6 +93,7 @@ def _record_demonstrations(options: argparse.Namespace) -> None:
         options.episodes,
         options.output,
         noise=options.noise,
+        pause=options.pause or 0.0,
         seed=options.seed,
         n_workers=options.workers,
         overwrite=options.overwrite,

@@ -1,5 +1,7 @@
 """The scripted demonstrators: success, variety, repetition, recovery, and what recording makes of them."""
 
+from dataclasses import replace
+
 import h5py
 import numpy as np
 import pytest
@@ -163,6 +165,23 @@ def test_noise_has_the_stated_size_and_is_recorded(tmp_path):
     assert np.abs(recorded).max() <= 1.0
 
 
+def test_the_hand_pauses_as_long_as_stated():
+    at_the_cube = np.zeros(19)
+    at_the_cube[3:7], at_the_cube[7:9] = DOWNWARD, (0.04, -0.04)
+    pauses = []
+    for seed in range(400):
+        demonstrator = LiftDemonstrator(seed, pause=20.0)
+        demonstrator.stage = "descend"
+        demonstrator.manner = replace(demonstrator.manner, grasp_offset=np.zeros(3))
+        demonstrator._misjudged_height = 0.0
+        pauses.append(0)
+        while demonstrator.act(at_the_cube)[6] < 0:
+            pauses[-1] += 1
+    # Geometric, from 1 on as the first step only begins the pause: mean 21, standard deviation 20.5
+    assert np.mean(pauses) == pytest.approx(21.0, abs=3 * 20.5 / 20)
+    assert np.std(pauses) == pytest.approx(20.5, rel=0.2)
+
+
 def test_existing_recording_is_kept_unless_told_otherwise(recording):
     path, _ = recording
     before = path.read_bytes()
@@ -184,6 +203,7 @@ def test_failed_recording_leaves_nothing(tmp_path, monkeypatch):
         ({"task": "stack"}, "task must be one of 'lift', 'can', got 'stack'"),
         ({"n_episodes": 0}, "n_episodes must be at least 1"),
         ({"noise": -0.1}, "noise must be a share of the action range, 0 or more, got -0.1"),
+        ({"pause": float("nan")}, "pause must be a number of steps, 0 or more, got nan"),
     ],
 )
 def test_wrong_arguments_are_named(arguments, message, tmp_path):
