@@ -77,7 +77,9 @@ def evaluate(
         returns, lengths = returns + rewards, lengths + 1
         for i in np.flatnonzero(starts):
             if playing[i] < n_episodes:
-                results[int(playing[i])] = (round(float(returns[i]), 4), int(lengths[i]), infos[i].get("is_success"))
+                # SB3's name of it, or that of gymnasium-robotics' mazes and hands
+                success = infos[i].get("is_success", infos[i].get("success"))
+                results[int(playing[i])] = (round(float(returns[i]), 4), int(lengths[i]), success)
             playing[i] += n_envs
         returns[starts], lengths[starts] = 0.0, 0
         if after_step is not None:

@@ -17,8 +17,8 @@ class Countdown(gym.Env):
     observation_space = spaces.Box(-np.inf, np.inf, (1,))
     action_space = spaces.Box(-1, 1, (1,))
 
-    def __init__(self, reports_success: bool = True) -> None:
-        self.reports_success = reports_success
+    def __init__(self, success_key: str | None = "is_success") -> None:
+        self.success_key = success_key
         self.left = self.seed = 0
 
     def reset(self, *, seed=None, options=None):
@@ -28,7 +28,7 @@ class Countdown(gym.Env):
 
     def step(self, action):
         self.left -= 1
-        info = {"is_success": self.seed % 2 == 0} if self.reports_success else {}
+        info = {self.success_key: self.seed % 2 == 0} if self.success_key else {}
         return np.array([self.left], np.float32), 2.0, self.left == 0, False, info
 
 
@@ -45,8 +45,8 @@ class Idle:
         return np.zeros((len(observations), 1), np.float32), state
 
 
-def vec_env(n_envs: int, reports_success: bool = True) -> DummyVecEnv:
-    return DummyVecEnv([lambda: SeededEpisodes(Countdown(reports_success)) for _ in range(n_envs)])
+def vec_env(n_envs: int, success_key: str | None = "is_success") -> DummyVecEnv:
+    return DummyVecEnv([lambda: SeededEpisodes(Countdown(success_key)) for _ in range(n_envs)])
 
 
 @pytest.mark.parametrize("n_envs", [1, 2, 3, 5, 8])
@@ -68,7 +68,11 @@ def test_evaluations_repeat_on_the_same_environments():
 
 
 def test_a_task_without_success_has_none():
-    assert evaluate(Idle(), vec_env(2, reports_success=False), [3, 4]).successes is None
+    assert evaluate(Idle(), vec_env(2, success_key=None), [3, 4]).successes is None
+
+
+def test_success_goes_by_the_name_that_gymnasium_robotics_has_for_it_too():
+    assert evaluate(Idle(), vec_env(2, success_key="success"), [3, 4]).successes == [False, True]
 
 
 def test_evaluations_come_at_a_fixed_interval_and_at_the_end_on_other_states(monkeypatch):
