@@ -1,12 +1,13 @@
 """The figure of a comparison: a row for each task, full and half data side by side."""
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sb3_dtfm.benchmark.runs import ALGORITHMS, Group, learning_curve
+from sb3_dtfm.benchmark.runs import ALGORITHMS, Group, learning_curve, steps_to_success
 from sb3_dtfm.zoo.arguments import UsageError
 
 if TYPE_CHECKING:
@@ -80,15 +81,8 @@ def plot_group(group: Group, output: Path, baselines: Sequence[Baseline] = (), a
     :param agent_line: draw the mean return of the recorded episodes
     :return: `output`
     """
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     regimes = group.regimes
-    with mpl.rc_context({"font.size": 11, "axes.spines.top": False, "axes.spines.right": False, "axes.axisbelow": True}):
-        figure = Figure(figsize=(PANEL[0] * len(regimes), PANEL[1] * len(group.tasks) + 0.5), layout="constrained")
-        FigureCanvasAgg(figure)
-        axes = figure.subplots(len(group.tasks), len(regimes), squeeze=False, sharey="row")
+    with _figure(len(group.tasks), len(regimes), output, "gradient steps") as axes:
         for task, row in zip(group.tasks, axes, strict=True):
             own = [baseline for baseline in baselines if baseline.task in (None, task)]
             for regime, axis in zip(regimes, row, strict=True):
@@ -96,8 +90,54 @@ def plot_group(group: Group, output: Path, baselines: Sequence[Baseline] = (), a
                 axis.set_title(f"{task}, {_share(regime)}", fontsize=11)
             row[0].set_ylabel(_unit(group, task))
             _limit(row, group, task, agent_line)
+    return output
+
+
+def plot_solved(group: Group, output: Path) -> Path | None:
+    """
+    Draw how soon the final episodes succeed: the share of them that has, by environment step.
+
+    :param group: the runs
+    :param output: PNG file to write
+    :return: `output`, or None if no task counts successes
+    """
+    tasks, regimes = group.success_tasks, group.regimes
+    if not tasks:
+        return None
+    with _figure(len(tasks), len(regimes), output, "environment steps") as axes:
+        for task, row in zip(tasks, axes, strict=True):
+            for regime, axis in zip(regimes, row, strict=True):
+                for algo, name in ALGORITHMS.items():
+                    if runs := group.of(task, regime, algo):
+                        steps = steps_to_success(runs)
+                        share = 100.0 * np.arange(1, len(steps) + 1) / len(steps)
+                        solved = np.isfinite(steps)
+                        longest = max(max(run.final["lengths"]) for run in runs)
+                        x = np.concatenate(([0.0], steps[solved], [longest]))
+                        y = np.concatenate(([0.0], share[solved], [100.0 * solved.mean()]))
+                        axis.step(x, y, where="post", color=COLORS[algo], linewidth=1.8, label=name)
+                axis.set_title(f"{task}, {_share(regime)}", fontsize=11)
+                axis.set_xlim(left=0)
+                axis.grid(color="0.9")
+            row[0].set_ylabel("episodes solved (%)")
+            row[0].set_ylim(-3, 103)
+    return output
+
+
+@contextlib.contextmanager
+def _figure(n_rows: int, n_columns: int, output: Path, x_label: str) -> Iterator[np.ndarray]:
+    """Panels (n_rows, n_columns) to draw in, with one legend; saved at the end."""
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context({"font.size": 11, "axes.spines.top": False, "axes.spines.right": False, "axes.axisbelow": True}):
+        figure = Figure(figsize=(PANEL[0] * n_columns, PANEL[1] * n_rows + 0.5), layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = figure.subplots(n_rows, n_columns, squeeze=False, sharey="row")
+        yield axes
         for axis in axes[-1]:
-            axis.set_xlabel("gradient steps")
+            axis.set_xlabel(x_label)
         handles = {
             label: handle for axis in axes.flat for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
         }
@@ -106,7 +146,6 @@ def plot_group(group: Group, output: Path, baselines: Sequence[Baseline] = (), a
         )
         output.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(output, dpi=150)
-    return output
 
 
 def _share(regime: float) -> str:

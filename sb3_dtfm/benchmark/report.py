@@ -5,16 +5,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_dtfm.benchmark.changes import split_changes
-from sb3_dtfm.benchmark.plots import check_baselines, plot_group, read_baseline
+from sb3_dtfm.benchmark.plots import check_baselines, plot_group, plot_solved, read_baseline
 from sb3_dtfm.benchmark.rows import merge_rows, result_files
 from sb3_dtfm.benchmark.runs import Group, group_runs
 from sb3_dtfm.benchmark.tables import make_report
 from sb3_dtfm.zoo.arguments import UsageError
 
 
-def figure_name(group: Group) -> str:
-    """File name of a group's figure."""
-    name = "-".join(part for part in ("curves", group.profile, group.label) if part)
+def figure_name(kind: str, group: Group) -> str:
+    """File name of a group's figure: of its learning "curves", or of what was "solved" by environment step."""
+    name = "-".join(part for part in (kind, group.profile, group.label) if part)
     return "".join(letter if letter.isalnum() or letter in "._-" else "-" for letter in name) + ".png"
 
 
@@ -53,8 +53,12 @@ def main(argv: Sequence[str]) -> None:
     output = Path(options.output)
     figures = {}
     for group in split_changes(groups)[0]:
-        figures[group.title] = figure_name(group)
-        print(plot_group(group, output / figures[group.title], baselines, not options.no_agent_line))
+        drawn = [
+            plot_group(group, output / figure_name("curves", group), baselines, not options.no_agent_line),
+            plot_solved(group, output / figure_name("solved", group)),
+        ]
+        figures[group.title] = [file.name for file in drawn if file is not None]
+        print(*(file for file in drawn if file is not None), sep="\n")
     report = output / "report.md"
     report.write_text(make_report(groups, figures, unfinished))
     print(report)

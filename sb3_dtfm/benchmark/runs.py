@@ -107,6 +107,11 @@ class Group(NamedTuple):
         """Runs of one cell, none if it was not run."""
         return self.runs.get((task, regime, algo), [])
 
+    @property
+    def success_tasks(self) -> list[str]:
+        """Those that report success, as far as run."""
+        return [task for task in self.tasks if any(run.counts_success for run in self.of_task(task))]
+
     def of_task(self, task: str) -> list[Run]:
         """All runs on one task."""
         return [run for (each, _, _), runs in self.runs.items() if each == task for run in runs]
@@ -178,6 +183,16 @@ def late_interval(runs: Sequence[Run]) -> Interval | None:
 def _pooled_success(rows: Sequence[Row]) -> Interval:
     successes = np.concatenate([row["successes"] for row in rows])
     return Interval(*(100.0 * limit for limit in wilson(int(successes.sum()), len(successes))))
+
+
+def steps_to_success(runs: Sequence[Run]) -> np.ndarray:
+    """Environment steps that each final episode of all runs took to succeed, ascending; inf for those that failed."""
+    steps = [
+        length if success else np.inf
+        for run in runs
+        for length, success in zip(run.final["lengths"], run.final["successes"], strict=True)
+    ]
+    return np.sort(np.array(steps, float))
 
 
 def learning_curve(runs: Sequence[Run]) -> Curve:

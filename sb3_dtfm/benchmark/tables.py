@@ -3,6 +3,8 @@
 import math
 from collections.abc import Callable, Iterable, Sequence
 
+import numpy as np
+
 from sb3_dtfm.benchmark.changes import changed_settings, compared_cells, split_changes
 from sb3_dtfm.benchmark.rows import Cell
 from sb3_dtfm.benchmark.runs import (
@@ -15,6 +17,7 @@ from sb3_dtfm.benchmark.runs import (
     late_interval,
     paired_scores,
     spread,
+    steps_to_success,
 )
 from sb3_dtfm.benchmark.statistics import (
     Interval,
@@ -29,22 +32,29 @@ CAPTION = (
     "Mean over seeds of the evaluations during training, and a 95 % band: Wilson's over the episodes of all seeds for "
     "success, Student's t over seeds for returns (over the episodes where there is one seed)."
 )
+SOLVED_CAPTION = (
+    "Share of the final episodes, of all seeds, that had succeeded by an environment step, and the median of it."
+)
 
 
-def make_report(groups: Sequence[Group], figures: dict[str, str], unfinished: Sequence[Cell] = ()) -> str:
+def make_report(groups: Sequence[Group], figures: dict[str, list[str]], unfinished: Sequence[Cell] = ()) -> str:
     """
     The whole report.
 
     :param groups: runs by profile and label
-    :param figures: file name of each group's figure, by the group's title
+    :param figures: file names by the group's title: of its learning curves, and of its successes by step if there are any
     :param unfinished: cells left out
     :return: Markdown
     """
     parts = ["# DT and DTFM compared", ""]
     alone, changed = split_changes(groups)
     for group in alone:
-        parts += [f"## Settings: {group.title}", "", f"![learning curves]({figures[group.title]})", "", CAPTION, ""]
-        parts += [*_achieved(group), "", *_intervals(group), "", *_scores(group), "", *_aggregates(group), ""]
+        curves, *solved = figures[group.title]
+        parts += [f"## Settings: {group.title}", "", f"![learning curves]({curves})", "", CAPTION, ""]
+        parts += [*_achieved(group), "", *_intervals(group), ""]
+        for file in solved:
+            parts += [f"![episodes solved by environment step]({file})", "", SOLVED_CAPTION, "", *_steps(group), ""]
+        parts += [*_scores(group), "", *_aggregates(group), ""]
         parts += [*_time(group), "", *_sources(group), ""]
     for base, labelled in changed:
         parts += [f"## Changes to: {base.title}", "", *_changes(base, labelled), ""]
@@ -142,6 +152,22 @@ def _bracket(interval: Interval, format_: Callable[[float], str]) -> str:
     if math.isnan(interval.low):
         return f"{format_(interval.estimate)} (one seed, no interval)"
     return f"{format_(interval.estimate)} [{format_(interval.low)}, {format_(interval.high)}]"
+
+
+def _steps(group: Group) -> list[str]:
+    """Table of how soon the median episode succeeds."""
+    rows = []
+    for task, regime in _cells(group):
+        if task in group.success_tasks:
+            rows.append([task, f"{regime:.0%}", *(_median_steps(group.of(task, regime, algo)) for algo in ALGORITHMS)])
+    return _table(["task", "data", *(f"{name} median steps to success" for name in ALGORITHMS.values())], rows)
+
+
+def _median_steps(runs: Sequence[Run]) -> str:
+    if not runs:
+        return NOT_RUN
+    median = float(np.median(steps_to_success(runs)))
+    return f"{median:.0f}" if math.isfinite(median) else NONE
 
 
 def _scores(group: Group) -> list[str]:

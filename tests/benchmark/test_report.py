@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sb3_dtfm.benchmark.rows import Cell, merge_rows, result_files
-from sb3_dtfm.benchmark.runs import group_runs, learning_curve, paired_scores, spread
+from sb3_dtfm.benchmark.runs import group_runs, learning_curve, paired_scores, spread, steps_to_success
 from sb3_dtfm.zoo.cli import main
 
 ROWS = Path(__file__).parent / "rows"
@@ -52,6 +52,12 @@ def test_the_curve_is_the_mean_over_seeds_with_a_pooled_band(groups):
     assert (curve.low[2], curve.high[2]) == pytest.approx((21.52, 78.48), abs=0.01)
 
 
+def test_steps_to_success_are_those_of_all_seeds_and_failures_take_for_ever(groups):
+    run = groups["small"].of(LIFT, 1.0, "dt")[0]
+    other = run._replace(final={**run.final, "lengths": [30, 50], "successes": [True, True]})
+    assert steps_to_success([run, other]).tolist() == [30, 40, 40, 40, 50, math.inf]
+
+
 def test_scores_are_shares_of_the_recorded_return(groups):
     keys, dt, dtfm = paired_scores(groups["small"], "final")
     assert keys == [(LIFT, 1.0), (CHEETAH, 0.5)]
@@ -62,12 +68,13 @@ def test_scores_are_shares_of_the_recorded_return(groups):
 def test_the_report_shows_what_was_run_and_what_was_not(tmp_path, capsys):
     assert main(["report", str(ROWS), "-o", str(tmp_path), "--tasks", LIFT, "Ant-v5"]) == 0
     text = (tmp_path / "report.md").read_text()
-    achieved, interval, pace = table_row(text, LIFT, "100%")
+    achieved, interval, steps, pace = table_row(text, LIFT, "100%")
     assert achieved == ["55.0 ± 7.1", "88.3 ± 10.4", "87.5 ± 17.7", "100.0 ± 0.0", "75.0 ± 0.0", "100.0 ± 0.0", "2 / 3"]
     # Late averages 50 and 60 with t of one degree of freedom: 55 +- 12.706 * 7.07 / 2**0.5;
     # 80, 85 and 100 with two: 88.3 +- 4.303 * 10.41 / 3**0.5
     assert interval[:2] == ["55.0 [0.0, 100.0]", "88.3 [62.5, 100.0]"]
     assert interval[2:] == ["75.0 [40.9, 92.9] % of 8 episodes", "100.0 [75.8, 100.0] % of 12 episodes"]
+    assert steps == ["40", "40"]
     assert pace == ["2.0", "12.5", "37.5", "2.0", "12.5", "50.0"]
     assert table_row(text, LIFT, "50%")[0] == ["*not run*"] * 6 + ["0 / 0"]
     assert len(table_row(text, "Ant-v5", "100%")) == 4
@@ -81,7 +88,9 @@ def test_the_report_shows_what_was_run_and_what_was_not(tmp_path, capsys):
     assert "Left out, as they have no final evaluation: HalfCheetah-v5, 100% of the data, dt, seed 0, small." in text
     assert "`local/halfcheetah/expert-v0`, 100 episodes, recorded from TQC: sampled actions" in text
     assert "](curves-small.png)" in text
+    assert "](solved-small.png)" in text
     assert (tmp_path / "curves-small.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "solved-small.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_label_stands_beside_the_same_cell_without_it(tmp_path):
@@ -100,6 +109,23 @@ def test_a_label_alone_is_a_group_of_its_own(tmp_path):
     assert main(["report", str(tmp_path), "-o", str(tmp_path)]) == 0
     assert "## Settings: small, ema" in (tmp_path / "report.md").read_text()
     assert (tmp_path / "curves-small-ema.png").exists()
+    assert not (tmp_path / "solved-small-ema.png").exists()
+
+
+def test_a_label_of_both_algorithms_is_a_comparison_of_its_own(tmp_path):
+    rows = (ROWS / "lift.jsonl").read_text()
+    few = rows.replace('"label": ""', '"label": "few"').replace('"regime": 1.0', '"regime": 0.1')
+    assert rows != few
+    (tmp_path / "rows.jsonl").write_text(rows + few)
+    assert main(["report", str(tmp_path / "rows.jsonl"), "-o", str(tmp_path)]) == 0
+    text = (tmp_path / "report.md").read_text()
+    assert [line for line in text.splitlines() if line.startswith("## ")] == [
+        "## Settings: small",
+        "## Settings: small, few",
+    ]
+    # Without the paper's full and half data, which are not what it is about
+    assert len(table_row(text.split("small, few")[1], LIFT)) == len(table_row(text.split("small, few")[1], LIFT, "10%"))
+    assert (tmp_path / "curves-small-few.png").exists()
 
 
 def test_a_baseline_is_drawn(tmp_path, monkeypatch):
