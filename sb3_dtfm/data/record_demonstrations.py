@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from gymnasium import spaces
 from tqdm import tqdm
 
 from sb3_dtfm.data.robomimic import DEFAULT_OBSERVATION_KEYS, RecordedEpisode, RobomimicWriter, refuse_existing
@@ -156,6 +157,7 @@ def _attempt(task: str, seed: int, noise: float, pause: float, attempt: int) -> 
     env = _environment(task)
     env_seed, demonstrator_seed, noise_seed = np.random.SeedSequence((seed, attempt)).generate_state(3)
     space, noise_rng = env.action_space, np.random.default_rng(int(noise_seed))
+    assert isinstance(space, spaces.Box)
     scale = noise * (space.high - space.low)
     demonstrator = DEMONSTRATORS[TASKS[task]](int(demonstrator_seed), pause)
     observation, _ = env.reset(seed=int(env_seed))
