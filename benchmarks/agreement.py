@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_dtfm.data import TrajectoryBuffer, load_dataset
 from sb3_dtfm.data.record_agent import load_agent
@@ -28,6 +29,14 @@ def split(buffer: TrajectoryBuffer, fraction: float, seed: int) -> dict[str, Tra
     return {"learned": learned} | ({"held out": buffer.select(others)} if len(others) else {})
 
 
+def algorithm_of(path: Path) -> type[BaseAlgorithm]:
+    """The class of a saved model, by the folder it is in."""
+    for part in path.parts:
+        if part in OFFLINE_ALGORITHMS:
+            return OFFLINE_ALGORITHMS[part]
+    raise SystemExit(f"{path}: of which algorithm? Expected a path with a folder {' or '.join(OFFLINE_ALGORITHMS)}.")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", nargs="+", type=Path)
@@ -40,8 +49,7 @@ def main() -> None:
     agent = load_agent(options.agent_algo, options.agent, "cpu")
     parts = split(load_dataset(options.dataset), options.fraction, options.dataset_seed)
     for path in options.models:
-        model = OFFLINE_ALGORITHMS[next(part for part in path.parts if part in OFFLINE_ALGORITHMS)].load(path, device="cpu")
-        policy = model.policy
+        policy = algorithm_of(path).load(path, device="cpu").policy
         for name, buffer in parts.items():
             batch = buffer.sample(N_WINDOWS, policy.context_length, th.Generator().manual_seed(0))
             wanted, _ = agent.predict(batch.observations[:, -1].numpy(), deterministic=True)

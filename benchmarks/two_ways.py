@@ -21,6 +21,7 @@ from matplotlib.patches import Rectangle
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_dtfm import DT, DTFM
+from sb3_dtfm.benchmark.evaluation import FINAL_STATES
 from sb3_dtfm.data.record_agent import check_dataset_id, write_dataset
 from sb3_dtfm.data.rollout import run_episodes
 from sb3_dtfm.envs import ReturnToGoWrapper
@@ -34,7 +35,6 @@ ENV_KWARGS = {
 DATASET_ID = "local/pointmaze/two-ways-v0"
 WAYPOINTS = [(1, -1), (1, 0), (1, 1)]  # cells to the right and up from the block; the left way is their mirror image
 GAIN, DAMPING = 4.0, 0.5  # of the controller, action units per metre and per metre/second
-FIRST_STATE = 2_000_000  # seed of the first initial state to plot: those of the benchmark's final evaluation
 NEAR = 0.35  # metres from a way-point at which the next one is headed for
 
 
@@ -75,7 +75,7 @@ def model_paths(model: BaseAlgorithm, n_episodes: int) -> list[np.ndarray]:
     """Positions (T + 1, 2) of the ball in each episode, in metres; acting deterministically."""
     env = ReturnToGoWrapper(gym.make(ENV_ID, **ENV_KWARGS), target_return=1.0)
     paths = []
-    for seed in range(FIRST_STATE, FIRST_STATE + n_episodes):
+    for seed in range(FINAL_STATES, FINAL_STATES + n_episodes):
         observation, _ = env.reset(seed=seed)
         state, start, over, path = None, np.ones(1, bool), False, []
         while not over:

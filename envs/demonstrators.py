@@ -99,7 +99,8 @@ class Demonstrator:
     A grasp that closes on nothing, or an object lost on the way, leads back to the hover point.
 
     :param seed: of everything random; the same seed and observations give the same actions
-    :param pause: steps that the hand rests before it closes, on average: people hesitate, and nothing tells for how long
+    :param pause: steps that the hand rests before it closes, on average and after a first one; 0 closes at once. People
+        hesitate, and nothing tells for how long
     """
 
     object_columns = slice(9, 12)  # where the observation holds the object's position

@@ -103,14 +103,14 @@ class Group(NamedTuple):
         """Whether both algorithms were run."""
         return {algo for _, _, algo in self.runs} == set(ALGORITHMS)
 
+    @property
+    def success_tasks(self) -> list[str]:
+        """Those whose runs, if there are any, all report success."""
+        return [task for task in self.tasks if (runs := self.of_task(task)) and all(run.counts_success for run in runs)]
+
     def of(self, task: str, regime: float, algo: str) -> list[Run]:
         """Runs of one cell, none if it was not run."""
         return self.runs.get((task, regime, algo), [])
-
-    @property
-    def success_tasks(self) -> list[str]:
-        """Those that report success, as far as run."""
-        return [task for task in self.tasks if any(run.counts_success for run in self.of_task(task))]
 
     def of_task(self, task: str) -> list[Run]:
         """All runs on one task."""

@@ -27,7 +27,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_dtfm.envs  # noqa: F401  (registers the tasks)
 from sb3_dtfm.data.minari import check_action_space
-from sb3_dtfm.data.rollout import ActFunction, RecordedEpisode, run_episodes, show_progress
+from sb3_dtfm.data.rollout import ActFunction, RecordedEpisode, check_recording, run_episodes, show_progress
 from sb3_dtfm.data.trajectories import DatasetError
 
 N_RANDOM_EPISODES = 10
@@ -81,7 +81,9 @@ def record_agent(
     :raises FileNotFoundError: no agent or normalisation file
     :raises ValueError: unknown algorithm, numbers out of range, or an agent that does not fit the environment
     """
-    check_arguments(n_episodes, noise, n_envs)
+    check_recording(n_episodes, noise)
+    if n_envs < 1:
+        raise ValueError(f"n_envs must be at least 1, got {n_envs}.")
     check_dataset_id(dataset_id, overwrite)
     for path in (model_path, vec_normalize_path):
         if path is not None and not Path(path).is_file():
@@ -111,20 +113,6 @@ def record_agent(
     finally:
         for each in envs:
             each.close()
-
-
-def check_arguments(n_episodes: int, noise: float, n_envs: int) -> None:
-    """
-    Refuse numbers out of range.
-
-    :raises ValueError: names the argument, what was given and what is accepted
-    """
-    if n_episodes < 1:
-        raise ValueError(f"n_episodes must be at least 1, got {n_episodes}.")
-    if n_envs < 1:
-        raise ValueError(f"n_envs must be at least 1, got {n_envs}.")
-    if not 0.0 <= noise < np.inf:
-        raise ValueError(f"noise must be a share of the action range, 0 or more, got {noise}.")
 
 
 def check_dataset_id(dataset_id: str, overwrite: bool) -> None:

@@ -5,9 +5,10 @@ import os
 import sys
 import time
 from collections import deque
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from gymnasium import spaces
 from tqdm import tqdm
 
 from sb3_dtfm.data.robomimic import DEFAULT_OBSERVATION_KEYS, RecordedEpisode, RobomimicWriter, refuse_existing
+from sb3_dtfm.data.rollout import check_recording
 from sb3_dtfm.envs.demonstrators import DEMONSTRATORS
 from sb3_dtfm.envs.robosuite import RobosuiteEnv
 
@@ -78,15 +80,13 @@ def record_demonstrations(
     :param progress: show a progress bar with the success rate
     :param noise: standard deviation of Gaussian noise on the actions, as a share of the action range (2); the sum is
         clipped into the action space, and what is recorded is what was executed
-    :param pause: steps that the hand rests before it closes, on average; geometrically distributed
+    :param pause: steps that the hand rests before it closes, on average and after a first one; geometrically distributed,
+        and 0 closes at once
     :raises FileExistsError: `output` exists and is not to be overwritten
     """
     if task not in TASKS:
         raise ValueError(f"task must be one of {', '.join(map(repr, TASKS))}, got {task!r}.")
-    if n_episodes < 1:
-        raise ValueError(f"n_episodes must be at least 1, got {n_episodes}.")
-    if not 0.0 <= noise < np.inf:
-        raise ValueError(f"noise must be a share of the action range, 0 or more, got {noise}.")
+    check_recording(n_episodes, noise)
     if not 0.0 <= pause < np.inf:
         raise ValueError(f"pause must be a number of steps, 0 or more, got {pause}.")
     refuse_existing(Path(output), overwrite)
@@ -98,7 +98,7 @@ def record_demonstrations(
     limit = n_episodes * ATTEMPTS_PER_EPISODE + 10
     with (
         RobomimicWriter(output, env.env_args, overwrite, seed) as writer,
-        closing(_attempts((task, seed, noise, pause), n_workers, limit)) as attempts,
+        closing(_attempts(partial(_attempt, task, seed, noise, pause), n_workers, limit)) as attempts,
     ):
         with tqdm(total=n_episodes, desc=f"Recording {task}", unit="episode", disable=not progress) as bar:
             for episode in attempts:
@@ -122,19 +122,19 @@ def _n_cores() -> int:
 
 
 def _attempts(
-    recording: tuple[str, int, float, float], n_workers: int, limit: int
+    attempt: Callable[[int], RecordedEpisode | None], n_workers: int, limit: int
 ) -> Generator[RecordedEpisode | None, None, None]:
-    """Episodes of a task, seed, noise and pause in the order of attempts, None for a failed one."""
+    """Episodes in the order of attempts, None for a failed one."""
     if n_workers == 1:
-        yield from (_attempt(*recording, attempt) for attempt in range(limit))
+        yield from map(attempt, range(limit))
         return
     # Linux forks: the workers then share what is imported already, and scripts need no __main__ guard.
     context = multiprocessing.get_context("fork" if sys.platform == "linux" else None)
     executor = ProcessPoolExecutor(n_workers, mp_context=context)
     pending: deque[Future[RecordedEpisode | None]] = deque()
     try:
-        for attempt in range(limit):
-            pending.append(executor.submit(_attempt, *recording, attempt))
+        for number in range(limit):
+            pending.append(executor.submit(attempt, number))
             if len(pending) > 2 * n_workers:
                 yield pending.popleft().result()
         while pending:

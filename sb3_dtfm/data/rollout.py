@@ -52,6 +52,20 @@ class RecordedEpisode:
         )
 
 
+def check_recording(n_episodes: int, noise: float) -> None:
+    """
+    Refuse numbers out of range that every recording has.
+
+    :param n_episodes: episodes to record
+    :param noise: standard deviation of action noise, as a share of the action range
+    :raises ValueError: names the argument, what was given and what is accepted
+    """
+    if n_episodes < 1:
+        raise ValueError(f"n_episodes must be at least 1, got {n_episodes}.")
+    if not 0.0 <= noise < np.inf:
+        raise ValueError(f"noise must be a share of the action range, 0 or more, got {noise}.")
+
+
 def stack_observations(observations: Sequence[Any]) -> Any:
     if isinstance(observations[0], dict):
         return {key: np.stack([observation[key] for observation in observations]) for key in observations[0]}

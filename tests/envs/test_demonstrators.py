@@ -10,6 +10,7 @@ from sb3_dtfm.data.record_demonstrations import RecordingSummary, record_demonst
 from sb3_dtfm.data.robomimic import load_robomimic
 from sb3_dtfm.envs.demonstrators import DEMONSTRATORS, DOWNWARD, LiftDemonstrator, _rotation_between
 from sb3_dtfm.envs.robosuite import RobosuiteEnv
+from sb3_dtfm.zoo.cli import main
 
 
 @pytest.fixture(scope="module")
@@ -163,6 +164,16 @@ def test_noise_has_the_stated_size_and_is_recorded(tmp_path):
     inside = np.abs(recorded) < 1.0
     assert np.std((recorded - own)[inside]) == pytest.approx(0.1, rel=0.15)
     assert np.abs(recorded).max() <= 1.0
+
+
+def test_noise_and_pause_reach_the_recording_from_the_command_line(tmp_path):
+    options = ["--demonstrator", "lift", "--episodes", "1", "--noise", "0.05", "--pause", "15", "--workers", "1"]
+    assert main(["record", *options, "--output", str(tmp_path / "first.hdf5")]) == 0
+    record_demonstrations("lift", 1, tmp_path / "second.hdf5", n_workers=1, progress=False, noise=0.05, pause=15.0)
+    assert_same_file(tmp_path / "first.hdf5", tmp_path / "second.hdf5")
+    record_demonstrations("lift", 1, tmp_path / "plain.hdf5", n_workers=1, progress=False)
+    with pytest.raises(AssertionError):
+        assert_same_file(tmp_path / "first.hdf5", tmp_path / "plain.hdf5")
 
 
 def test_the_hand_pauses_as_long_as_stated():

@@ -23,7 +23,6 @@ HEAD_KEYS = {
     "flow_hidden_dim",
     "flow_n_layers",
     "flow_prediction",
-    "n_flow_draws",
     "solver",
     "n_solver_steps",
     "one_step",
