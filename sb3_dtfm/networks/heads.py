@@ -56,8 +56,9 @@ class FlowHead(nn.Module):
     With `one_step` a second network learns where that ends, so that an action can take one evaluation instead of one per
     solver step. It learns from the field and gives nothing back: trunk and field are what they are without it.
 
-    A network that predicts the action x1 gives the velocity (x1 - x) / (1 - tau). What it has to learn is then bounded, does
-    not depend on the noise where the data have one mode, and is what the last Euler step lands on.
+    A network that predicts the action x1 gives the velocity (x1 - x) / (1 - tau). What it has to learn is then bounded, by
+    tanh as in :class:`RegressionHead`, does not depend on the noise where the data have one mode, and is what the last Euler
+    step lands on.
 
     :param embed_dim: D
     :param action_dim: A
@@ -101,7 +102,12 @@ class FlowHead(nn.Module):
         x, velocity = interpolate(noise, actions, tau.unsqueeze(-1))
         film = self.vector_field.film_condition(hidden).unsqueeze(1) + self.vector_field.time_share(tau)
         target = velocity if self.prediction == "velocity" else actions
-        return masked_mean((self.vector_field(x, film) - target).square(), mask.unsqueeze(1).expand(tau.shape))
+        return masked_mean((self._predict(x, film) - target).square(), mask.unsqueeze(1).expand(tau.shape))
+
+    def _predict(self, x: th.Tensor, film: th.Tensor) -> th.Tensor:
+        """The velocity, or the action within its bounds, (..., A), at points (..., A) of the path."""
+        output = self.vector_field(x, film)
+        return output if self.prediction == "velocity" else output.tanh()
 
     def one_step_loss(self, hidden: th.Tensor, mask: th.Tensor, noise: th.Tensor) -> th.Tensor:
         """
@@ -139,9 +145,9 @@ class FlowHead(nn.Module):
             nonlocal velocity
             i = round(tau * (len(times) - 1))
             if self.prediction == "velocity":
-                velocity = self.vector_field(x, condition + time_shares[i])
+                velocity = self._predict(x, condition + time_shares[i])
             elif i < len(times) - 1:
-                velocity = (self.vector_field(x, condition + time_shares[i]) - x) / (1.0 - tau)
+                velocity = (self._predict(x, condition + time_shares[i]) - x) / (1.0 - tau)
             # Heun and RK4 look at tau = 1 too, where a predicted action gives 0 / 0: the slope before it stands in.
             return velocity
 

@@ -89,7 +89,7 @@ def test_a_predicted_action_is_where_every_solver_ends(solver, n_solver_steps):
     action = th.tensor([0.3, -0.8])
     with th.no_grad():
         head.vector_field.output.weight.zero_()
-        head.vector_field.output.bias.copy_(action)
+        head.vector_field.output.bias.copy_(action.atanh())
         th.testing.assert_close(head(th.randn(5, 4), th.randn(5, 2), solver, n_solver_steps), action.expand(5, 2))
 
 
@@ -105,9 +105,20 @@ def test_the_loss_of_several_draws_is_the_mean_of_each_over_valid_steps(predicti
     for row, step in mask.nonzero().tolist():
         x = (1 - tau[row, 0, step]) * noise[row, 0, step] + tau[row, 0, step] * actions[row, step]
         film = head.vector_field.film_condition(hidden[row, step]) + head.vector_field.time_share(tau[row, 0, step])
-        target = actions[row, step] - (noise[row, 0, step] if prediction == "velocity" else 0)
-        by_hand.append((head.vector_field(x, film) - target).square().mean())
+        output = head.vector_field(x, film)
+        velocity = actions[row, step] - noise[row, 0, step]
+        error = output - velocity if prediction == "velocity" else output.tanh() - actions[row, step]
+        by_hand.append(error.square().mean())
     th.testing.assert_close(each[0], th.stack(by_hand).mean())
+
+
+@pytest.mark.parametrize("n_solver_steps", [1, 3, 50])
+def test_a_predicted_action_stays_within_the_bounds(n_solver_steps):
+    head = FlowHead(embed_dim=4, action_dim=2, hidden_dim=8, prediction="action")
+    with th.no_grad():
+        head.vector_field.output.weight.mul_(1000.0)
+        actions = head(10 * th.randn(500, 4), th.randn(500, 2), "euler", n_solver_steps)
+    assert 0.9 < actions.abs().max() < 1.0 + 1e-6
 
 
 def test_unknown_predictions_are_refused_by_name():
