@@ -56,9 +56,10 @@ class FlowHead(nn.Module):
     With `one_step` a second network learns where that ends, so that an action can take one evaluation instead of one per
     solver step. It learns from the field and gives nothing back: trunk and field are what they are without it.
 
-    A network that predicts the action x1 gives the velocity (x1 - x) / (1 - tau). What it has to learn is then bounded, by
-    tanh as in :class:`RegressionHead`, does not depend on the noise where the data have one mode, and is what the last Euler
-    step lands on.
+    A network that predicts the action x1 gives the velocity (x1 - x) / (1 - tau). What it has to learn is then bounded, does
+    not depend on the noise where the data have one mode, and is what the last Euler step lands on. The prediction is
+    tanh(W h + b + FiLM network), whose last term starts at zero: training starts from :class:`RegressionHead`, and what
+    noise and time have to add to it is learned.
 
     :param embed_dim: D
     :param action_dim: A
@@ -81,8 +82,11 @@ class FlowHead(nn.Module):
         super().__init__()
         if prediction not in PREDICTIONS:
             raise ValueError(f"prediction must be one of {', '.join(PREDICTIONS)}, got {prediction!r}.")
-        self.prediction = prediction
         self.vector_field = VectorField(action_dim, embed_dim, hidden_dim, n_layers)
+        self.regression = Linear(embed_dim, action_dim) if prediction == "action" else None
+        if prediction == "action":
+            nn.init.zeros_(self.vector_field.output.weight)
+            nn.init.zeros_(self.vector_field.output.bias)
         self.jump = FilmNetwork(action_dim, embed_dim, hidden_dim, n_layers) if one_step else None
 
     def loss(self, hidden: th.Tensor, actions: th.Tensor, mask: th.Tensor, noise: th.Tensor, tau: th.Tensor) -> th.Tensor:
@@ -95,19 +99,18 @@ class FlowHead(nn.Module):
         :param actions: (B, K, A) in [-1, 1]
         :param mask: (B, K) bool
         :param noise: (B, n, K, A), standard normal: n draws for each hidden state
-        :param tau: (B, n, K), uniform in [0, 1]
+        :param tau: (B, n, K) in [0, 1]
         :return: mean squared error over valid steps and draws
         """
         actions = actions.unsqueeze(1)
         x, velocity = interpolate(noise, actions, tau.unsqueeze(-1))
         film = self.vector_field.film_condition(hidden).unsqueeze(1) + self.vector_field.time_share(tau)
-        target = velocity if self.prediction == "velocity" else actions
-        return masked_mean((self._predict(x, film) - target).square(), mask.unsqueeze(1).expand(tau.shape))
-
-    def _predict(self, x: th.Tensor, film: th.Tensor) -> th.Tensor:
-        """The velocity, or the action within its bounds, (..., A), at points (..., A) of the path."""
         output = self.vector_field(x, film)
-        return output if self.prediction == "velocity" else output.tanh()
+        if self.regression is None:
+            error = output - velocity
+        else:
+            error = (self.regression(hidden).unsqueeze(1) + output).tanh() - actions
+        return masked_mean(error.square(), mask.unsqueeze(1).expand(tau.shape))
 
     def one_step_loss(self, hidden: th.Tensor, mask: th.Tensor, noise: th.Tensor) -> th.Tensor:
         """
@@ -138,16 +141,17 @@ class FlowHead(nn.Module):
             return noise + self.jump(noise, self.jump.film_condition(hidden))
         times = solver_times(solver, n_solver_steps).to(hidden.device)
         condition, time_shares = self.vector_field.film_condition(hidden), self.vector_field.time_share(times)
-
+        regressed = None if self.regression is None else self.regression(hidden)
         velocity = noise
 
         def field(x: th.Tensor, tau: float) -> th.Tensor:
             nonlocal velocity
             i = round(tau * (len(times) - 1))
-            if self.prediction == "velocity":
-                velocity = self._predict(x, condition + time_shares[i])
+            if regressed is None:
+                velocity = self.vector_field(x, condition + time_shares[i])
             elif i < len(times) - 1:
-                velocity = (self._predict(x, condition + time_shares[i]) - x) / (1.0 - tau)
+                action = (regressed + self.vector_field(x, condition + time_shares[i])).tanh()
+                velocity = (action - x) / (1.0 - tau)
             # Heun and RK4 look at tau = 1 too, where a predicted action gives 0 / 0: the slope before it stands in.
             return velocity
 

@@ -1,5 +1,6 @@
 """The policy of Decision Transformer with flow matching."""
 
+import math
 from typing import Any
 
 import torch as th
@@ -27,6 +28,8 @@ class DTFMPolicy(SequencePolicy):
     :param flow_hidden_dim: width of the vector field's hidden layers
     :param flow_n_layers: number of its hidden layers
     :param flow_prediction: what the vector field's network puts out: "velocity", or "action", which implies the velocity
+    :param flow_tau_exponent: tau of the loss is u to this power for u uniform in [0, 1]: above 1 it is more often near the
+        noise, where the action has to come from the hidden state
     :param n_flow_draws: pairs of noise and tau for each hidden state and gradient step: the head is cheap beside the trunk
     :param solver: how to act: an ODE solver, euler, midpoint, heun or rk4; or one_step, the network that learnt its end
     :param n_solver_steps: steps of the ODE solver
@@ -44,6 +47,7 @@ class DTFMPolicy(SequencePolicy):
         flow_hidden_dim: int = 512,
         flow_n_layers: int = 3,
         flow_prediction: str = "velocity",
+        flow_tau_exponent: float = 1.0,
         n_flow_draws: int = 1,
         solver: str = "euler",
         n_solver_steps: int = 50,
@@ -54,6 +58,9 @@ class DTFMPolicy(SequencePolicy):
         self.flow_hidden_dim = flow_hidden_dim
         self.flow_n_layers = flow_n_layers
         self.flow_prediction = flow_prediction
+        if not 0.0 < flow_tau_exponent < math.inf:
+            raise ValueError(f"flow_tau_exponent must be positive and finite, got {flow_tau_exponent}.")
+        self.flow_tau_exponent = flow_tau_exponent
         if n_flow_draws < 1:
             raise ValueError(f"n_flow_draws must be at least 1, got {n_flow_draws}.")
         self.n_flow_draws = n_flow_draws
@@ -83,7 +90,7 @@ class DTFMPolicy(SequencePolicy):
         n_rows, length, action_dim = batch.actions.shape
         shape, device = (n_rows, self.n_flow_draws, length), batch.actions.device
         noise = th.randn(*shape, action_dim, generator=generator, device=device)
-        tau = th.rand(shape, generator=generator, device=device)
+        tau = th.rand(shape, generator=generator, device=device) ** self.flow_tau_exponent
         return noise, tau
 
     def compute_loss(self, batch: Any, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
@@ -144,6 +151,7 @@ class DTFMPolicy(SequencePolicy):
         return {**super()._acting_settings(), "solver": self.solver, "n_solver_steps": self.n_solver_steps}
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        names = ("flow_hidden_dim", "flow_n_layers", "flow_prediction", "n_flow_draws", "one_step", "regression_coef")
+        flow_names = ("flow_hidden_dim", "flow_n_layers", "flow_prediction", "flow_tau_exponent", "n_flow_draws")
+        names = (*flow_names, "one_step", "regression_coef")
         own = {name: getattr(self, name) for name in names}
         return {**super()._get_constructor_parameters(), **own, **self._acting_settings()}

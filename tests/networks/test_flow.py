@@ -5,9 +5,10 @@ import math
 
 import pytest
 import torch as th
+from torch import nn
 
 from sb3_dtfm.networks.flow import SOLVERS, VectorField, check_solver, integrate, interpolate, sinusoidal_embedding
-from sb3_dtfm.networks.heads import PREDICTIONS, FlowHead
+from sb3_dtfm.networks.heads import PREDICTIONS, FlowHead, RegressionHead
 
 ORDERS = {"euler": 1, "midpoint": 2, "heun": 2, "rk4": 4}
 
@@ -88,14 +89,15 @@ def test_a_predicted_action_is_where_every_solver_ends(solver, n_solver_steps):
     head = FlowHead(embed_dim=4, action_dim=2, hidden_dim=8, prediction="action")
     action = th.tensor([0.3, -0.8])
     with th.no_grad():
-        head.vector_field.output.weight.zero_()
-        head.vector_field.output.bias.copy_(action.atanh())
+        head.regression.weight.zero_()
+        head.regression.bias.copy_(action.atanh())
         th.testing.assert_close(head(th.randn(5, 4), th.randn(5, 2), solver, n_solver_steps), action.expand(5, 2))
 
 
 @pytest.mark.parametrize("prediction", PREDICTIONS)
 def test_the_loss_of_several_draws_is_the_mean_of_each_over_valid_steps(prediction):
     head = FlowHead(embed_dim=4, action_dim=2, hidden_dim=8, prediction=prediction)
+    nn.init.normal_(head.vector_field.output.weight)
     hidden, actions = th.randn(3, 5, 4), th.rand(3, 5, 2)
     noise, tau = th.randn(3, 4, 5, 2), th.rand(3, 4, 5)
     mask = th.tensor([[0, 0, 1, 1, 1], [1, 1, 1, 1, 1], [0, 1, 1, 1, 1]], dtype=th.bool)
@@ -106,8 +108,10 @@ def test_the_loss_of_several_draws_is_the_mean_of_each_over_valid_steps(predicti
         x = (1 - tau[row, 0, step]) * noise[row, 0, step] + tau[row, 0, step] * actions[row, step]
         film = head.vector_field.film_condition(hidden[row, step]) + head.vector_field.time_share(tau[row, 0, step])
         output = head.vector_field(x, film)
-        velocity = actions[row, step] - noise[row, 0, step]
-        error = output - velocity if prediction == "velocity" else output.tanh() - actions[row, step]
+        if prediction == "velocity":
+            error = output - (actions[row, step] - noise[row, 0, step])
+        else:
+            error = (head.regression(hidden[row, step]) + output).tanh() - actions[row, step]
         by_hand.append(error.square().mean())
     th.testing.assert_close(each[0], th.stack(by_hand).mean())
 
@@ -116,9 +120,18 @@ def test_the_loss_of_several_draws_is_the_mean_of_each_over_valid_steps(predicti
 def test_a_predicted_action_stays_within_the_bounds(n_solver_steps):
     head = FlowHead(embed_dim=4, action_dim=2, hidden_dim=8, prediction="action")
     with th.no_grad():
-        head.vector_field.output.weight.mul_(1000.0)
+        head.regression.weight.mul_(1000.0)
         actions = head(10 * th.randn(500, 4), th.randn(500, 2), "euler", n_solver_steps)
     assert 0.9 < actions.abs().max() < 1.0 + 1e-6
+
+
+def test_a_head_that_predicts_actions_starts_as_decision_transformers():
+    head, regression = FlowHead(embed_dim=4, action_dim=2, hidden_dim=8, prediction="action"), RegressionHead(4, 2)
+    regression.linear.load_state_dict(head.regression.state_dict())
+    hidden, actions, mask = th.randn(3, 5, 4), th.rand(3, 5, 2), th.ones(3, 5, dtype=th.bool)
+    noise, tau = th.randn(3, 1, 5, 2), th.rand(3, 1, 5)
+    th.testing.assert_close(head.loss(hidden, actions, mask, noise, tau), regression.loss(hidden, actions, mask))
+    th.testing.assert_close(head(hidden, noise[:, 0], "euler", 3), regression(hidden))
 
 
 def test_unknown_predictions_are_refused_by_name():

@@ -23,6 +23,7 @@ HEAD_KEYS = {
     "flow_hidden_dim",
     "flow_n_layers",
     "flow_prediction",
+    "flow_tau_exponent",
     "solver",
     "n_solver_steps",
     "one_step",
