@@ -6,6 +6,7 @@ How near trained models' actions are to those of the agent that was recorded, ha
 
 Models are told apart by `/dt/` and `/dtfm/` in their paths, where `sb3-dtfm train` and `benchmark` put them. Prints the root
 mean square of the difference, in units of [-1, 1], at the last step of windows: of episodes learned from, and of the others.
+And the share of the recorded numbers that lie at a bound of their action.
 """
 
 import argparse
@@ -29,6 +30,12 @@ def split(buffer: TrajectoryBuffer, fraction: float, seed: int) -> dict[str, Tra
     return {"learned": learned} | ({"held out": buffer.select(others)} if len(others) else {})
 
 
+def share_at_bounds(buffer: TrajectoryBuffer) -> float:
+    """Of all action dimensions at all steps, those whose action was as small or as large as it can be."""
+    actions = buffer.sample(N_WINDOWS, 1, th.Generator().manual_seed(0)).actions.numpy()
+    return float(((actions <= buffer.action_space.low) | (actions >= buffer.action_space.high)).mean())
+
+
 def algorithm_of(path: Path) -> type[BaseAlgorithm]:
     """The class of a saved model, by the folder it is in."""
     for part in path.parts:
@@ -47,7 +54,9 @@ def main() -> None:
     parser.add_argument("--dataset-seed", type=int, default=0)
     options = parser.parse_args()
     agent = load_agent(options.agent_algo, options.agent, "cpu")
-    parts = split(load_dataset(options.dataset), options.fraction, options.dataset_seed)
+    recorded = load_dataset(options.dataset)
+    parts = split(recorded, options.fraction, options.dataset_seed)
+    print(f"{options.dataset}: {share_at_bounds(recorded):.1%} of the recorded actions' numbers are at a bound")
     for path in options.models:
         policy = algorithm_of(path).load(path, device="cpu").policy
         for name, buffer in parts.items():
