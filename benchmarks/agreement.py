@@ -32,7 +32,7 @@ def split(buffer: TrajectoryBuffer, fraction: float, seed: int) -> dict[str, Tra
 
 def share_at_bounds(buffer: TrajectoryBuffer) -> float:
     """Of all action dimensions at all steps, those whose action was as small or as large as it can be."""
-    actions = buffer.sample(N_WINDOWS, 1, th.Generator().manual_seed(0)).actions.numpy()
+    actions = buffer.actions.numpy()
     return float(((actions <= buffer.action_space.low) | (actions >= buffer.action_space.high)).mean())
 
 

@@ -210,11 +210,17 @@ def test_several_flow_draws_and_action_prediction_train_and_are_saved(cheetah_bu
     batch = model.buffer.sample(4, 3, th.Generator().manual_seed(0))
     noise, tau = model.policy.draw_noise(batch, th.Generator().manual_seed(0))
     assert (noise.shape, tau.shape) == ((4, 3, 3, 6), (4, 3, 3))
+    model.policy.flow_tau_exponent = 1.0
+    _, uniform = model.policy.draw_noise(batch, th.Generator().manual_seed(0))
+    th.testing.assert_close(tau, uniform.square())
+    model.policy.flow_tau_exponent = 2.0
     model.learn(3).save(tmp_path / "model")
     policy = DTFM.load(tmp_path / "model").policy
     assert (policy.n_flow_draws, policy.flow_prediction, policy.flow_tau_exponent) == (3, "action", 2.0)
     with pytest.raises(ValueError, match="n_flow_draws must be at least 1, got 0"):
         DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs={**TINY_FLOW_POLICY, "n_flow_draws": 0})
+    with pytest.raises(ValueError, match="flow_tau_exponent must be positive and finite, got 0"):
+        DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs={**TINY_FLOW_POLICY, "flow_tau_exponent": 0})
 
 
 def test_learning_rate_warms_up_and_decays(cheetah_buffer):

@@ -105,7 +105,7 @@ class Group(NamedTuple):
 
     @property
     def success_tasks(self) -> list[str]:
-        """Those whose runs, if there are any, all report success."""
+        """Those with runs, all of which report success."""
         return [task for task in self.tasks if (runs := self.of_task(task)) and all(run.counts_success for run in runs)]
 
     def of(self, task: str, regime: float, algo: str) -> list[Run]:

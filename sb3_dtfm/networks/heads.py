@@ -8,7 +8,7 @@ from sb3_dtfm.networks.linear import Linear
 
 # Solver steps whose end the one-step network learns.
 DISTILLED_STEPS = 16
-# What the field's network puts out: the velocity itself, or the action that the path leads to.
+# What is learned of the path: its velocity, or the action that it leads to.
 PREDICTIONS = ("velocity", "action")
 
 
@@ -66,7 +66,7 @@ class FlowHead(nn.Module):
     :param hidden_dim: width of the vector field's hidden layers
     :param n_layers: number of hidden layers of the vector field
     :param one_step: have the second network
-    :param prediction: what the field's network puts out, one of `PREDICTIONS`
+    :param prediction: what is learned of the path, one of `PREDICTIONS`
     :raises ValueError: unknown prediction
     """
 
@@ -83,8 +83,9 @@ class FlowHead(nn.Module):
         if prediction not in PREDICTIONS:
             raise ValueError(f"prediction must be one of {', '.join(PREDICTIONS)}, got {prediction!r}.")
         self.vector_field = VectorField(action_dim, embed_dim, hidden_dim, n_layers)
-        self.regression = Linear(embed_dim, action_dim) if prediction == "action" else None
+        self.regression = None
         if prediction == "action":
+            self.regression = Linear(embed_dim, action_dim)
             nn.init.zeros_(self.vector_field.output.weight)
             nn.init.zeros_(self.vector_field.output.bias)
         self.jump = FilmNetwork(action_dim, embed_dim, hidden_dim, n_layers) if one_step else None

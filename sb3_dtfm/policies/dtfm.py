@@ -27,7 +27,8 @@ class DTFMPolicy(SequencePolicy):
 
     :param flow_hidden_dim: width of the vector field's hidden layers
     :param flow_n_layers: number of its hidden layers
-    :param flow_prediction: what the vector field's network puts out: "velocity", or "action", which implies the velocity
+    :param flow_prediction: what the head learns of the path: its "velocity", or the "action" it leads to, within its bounds
+        by tanh, from which the velocity follows
     :param flow_tau_exponent: tau of the loss is u to this power for u uniform in [0, 1]: above 1 it is more often near the
         noise, where the action has to come from the hidden state
     :param n_flow_draws: pairs of noise and tau for each hidden state and gradient step: the head is cheap beside the trunk
