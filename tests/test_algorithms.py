@@ -223,6 +223,18 @@ def test_several_flow_draws_and_action_prediction_train_and_are_saved(cheetah_bu
         DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs={**TINY_FLOW_POLICY, "flow_tau_exponent": 0})
 
 
+@pytest.mark.parametrize(("algorithm", "policy_kwargs"), ALGORITHMS, ids=IDS)
+def test_without_time_steps_and_with_more_starts(algorithm, policy_kwargs, cheetah_buffer, tmp_path):
+    policy_kwargs = {**policy_kwargs, "timestep_embedding": False}
+    model = make_model(algorithm, cheetah_buffer, policy_kwargs=policy_kwargs, timestep_exponent=1.5)
+    model.learn(3).save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model")
+    assert loaded.timestep_exponent == 1.5
+    assert loaded.policy.network.trunk.embed_timestep is None
+    with pytest.raises(ValueError, match="timestep_exponent must be positive and finite, got -1"):
+        make_model(algorithm, cheetah_buffer, timestep_exponent=-1.0)
+
+
 def test_learning_rate_warms_up_and_decays(cheetah_buffer):
     rates = logged_learning_rates(
         make_model(DT, cheetah_buffer, learning_rate=1.0e-3, warmup_steps=4, learning_rate_schedule="linear"), 10

@@ -51,6 +51,8 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
     :param context_length: K, steps the policy sees
     :param dataset_fraction: share of the episodes to learn from, randomly drawn
     :param dataset_seed: seed of that draw alone, so that different runs learn from the same episodes
+    :param timestep_exponent: the windows of a gradient step end at time step T u^e of an episode of T steps, for u uniform in
+        [0, 1]: above 1 an episode's start, of which there is little in long episodes, is learned from more often
     :param dataset_kwargs: further arguments of :func:`~sb3_dtfm.data.load_dataset`: `{"cache_dir": folder}` for datasets
         larger than memory, and the reader's own, for example `{"filter_key": "train"}` for robomimic
     :param max_grad_norm: clip the gradient's norm to this; None does not clip
@@ -84,6 +86,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         context_length: int = 20,
         dataset_fraction: float = 1.0,
         dataset_seed: int = 0,
+        timestep_exponent: float = 1.0,
         dataset_kwargs: dict[str, Any] | None = None,
         max_grad_norm: float | None = None,
         warmup_steps: int = 0,
@@ -118,6 +121,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         self.context_length = context_length
         self.dataset_fraction = dataset_fraction
         self.dataset_seed = dataset_seed
+        self.timestep_exponent = timestep_exponent
         self.dataset_kwargs = dataset_kwargs
         self.max_grad_norm = max_grad_norm
         self.warmup_steps = warmup_steps
@@ -148,6 +152,8 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         for name in ("batch_size", "context_length"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        if not 0.0 < self.timestep_exponent < math.inf:
+            raise ValueError(f"timestep_exponent must be positive and finite, got {self.timestep_exponent}.")
         if not 0.0 <= self.ema_decay < 1.0:
             raise ValueError(f"ema_decay must lie in [0, 1), got {self.ema_decay}.")
         check_batch_size(self.batch_size)
@@ -288,7 +294,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         parallel = DataParallel(self.policy, self._loss_function(), self.batch_size)
         generator = self._training_generator(parallel)
         callback.on_training_start(locals(), globals())
-        ends = buffer.draw(self.batch_size, generator)
+        ends = buffer.draw(self.batch_size, generator, self.timestep_exponent)
         while self.num_timesteps < total_timesteps:
             step_start = time.perf_counter()
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
@@ -323,7 +329,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         self.policy.optimizer.zero_grad(set_to_none=True)  # before the loss, which has the most in memory
         batch = buffer.windows(ends, self.policy.window_length)
         loss, parts = parallel.compute_loss(batch, *self.policy.draw_noise(batch, generator))
-        next_ends = buffer.draw(self.batch_size, generator)
+        next_ends = buffer.draw(self.batch_size, generator, self.timestep_exponent)
         buffer.prefetch(next_ends, self.policy.window_length)
         loss.backward()
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.clipped_parameters(), self.max_grad_norm or math.inf)

@@ -247,15 +247,25 @@ class TrajectoryBuffer:
         """
         return self.windows(self.draw(batch_size, generator), context_length)
 
-    def draw(self, batch_size: int, generator: th.Generator | None = None) -> th.Tensor:
+    def draw(
+        self, batch_size: int, generator: th.Generator | None = None, timestep_exponent: float = 1.0
+    ) -> th.Tensor:
         """
         The random part of :meth:`sample`: what to give to :meth:`windows`.
 
         :param batch_size: B
         :param generator: source of randomness, on the buffer's device
+        :param timestep_exponent: e of the time step T u^e in an episode of T steps, for u uniform in [0, 1]
         :return: (B,) int64 positions among the buffer's own steps
         """
-        return th.randint(len(self), (batch_size,), generator=generator, device=self.device)
+        positions = th.randint(len(self), (batch_size,), generator=generator, device=self.device)
+        if timestep_exponent == 1.0:
+            return positions
+        u = th.rand(batch_size, generator=generator, device=self.device).to(self._stops.device)
+        episodes = th.searchsorted(self._stops, positions.to(self._stops.device), right=True)
+        firsts, lasts = self._firsts[episodes], self._stops[episodes] - 1
+        timesteps = ((lasts + 1 - firsts) * u**timestep_exponent).long()
+        return th.minimum(firsts + timesteps, lasts).to(self.device)  # a product may round to T
 
     def prefetch(self, ends: th.Tensor, context_length: int) -> None:
         """

@@ -94,6 +94,9 @@ class SequenceTrunk(nn.Module):
     embedding of the absolute time step. The hidden state of step t is read at its observation token: it has seen
     return-to-go and observation of t and everything before them, and not the action of t.
 
+    Without `timestep_embedding` the order of tokens shows in the causal mask alone (Kazemnejad et al., 2023), and nothing
+    is learned that holds for one time step only.
+
     :param observation_dim: O
     :param action_dim: A
     :param max_timestep: number of embedded time steps; later ones share the last embedding
@@ -101,6 +104,7 @@ class SequenceTrunk(nn.Module):
     :param n_layers: number of blocks
     :param n_heads: attention heads, a divisor of `embed_dim`
     :param dropout: probability on embeddings, attention weights and residual branches
+    :param timestep_embedding: add the embeddings of time steps
     """
 
     def __init__(
@@ -112,6 +116,7 @@ class SequenceTrunk(nn.Module):
         n_layers: int = 10,
         n_heads: int = 2,
         dropout: float = 0.1,
+        timestep_embedding: bool = True,
     ) -> None:
         super().__init__()
         if embed_dim % n_heads:
@@ -126,7 +131,7 @@ class SequenceTrunk(nn.Module):
         self.embed_return_to_go = Linear(1, embed_dim)
         self.embed_observation = Linear(observation_dim, embed_dim)
         self.embed_action = Linear(action_dim, embed_dim)
-        self.embed_timestep = nn.Embedding(max_timestep, embed_dim)
+        self.embed_timestep = nn.Embedding(max_timestep, embed_dim) if timestep_embedding else None
         self.dropout = dropout
         self.blocks = nn.ModuleList(TransformerBlock(embed_dim, n_heads, dropout) for _ in range(n_layers))
         self.final_norm = nn.LayerNorm(embed_dim)
@@ -213,6 +218,9 @@ class SequenceTrunk(nn.Module):
         return self.final_norm(tokens[:, -1])
 
     def _time(self, timesteps: th.Tensor) -> th.Tensor:
+        """What to add to the tokens of steps (B, N): embeddings (B, N, D), or zeros (B, N, 1) where there are none."""
+        if self.embed_timestep is None:
+            return th.zeros_like(timesteps, dtype=self.final_norm.weight.dtype).unsqueeze(-1)
         return self.embed_timestep(timesteps.clamp(max=self.embed_timestep.num_embeddings - 1))
 
     def _attention_bias(self, allowed: th.Tensor) -> th.Tensor:

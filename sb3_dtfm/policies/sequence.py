@@ -64,6 +64,7 @@ class SequencePolicy(BasePolicy):
     :param n_layers: number of Transformer blocks
     :param n_heads: attention heads
     :param dropout: dropout probability of the trunk
+    :param timestep_embedding: tell the trunk the absolute time step, as Decision Transformer does
     :param weight_decay: AdamW's, on weight matrices only
     :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step. Asking for more than
         any episode reached, or falling behind, then stays an input like those the policy learned from
@@ -93,6 +94,7 @@ class SequencePolicy(BasePolicy):
         n_layers: int = 10,
         n_heads: int = 2,
         dropout: float = 0.1,
+        timestep_embedding: bool = True,
         weight_decay: float = 1e-3,
         clip_return_to_go: bool = False,
         ema: bool = False,
@@ -106,6 +108,7 @@ class SequencePolicy(BasePolicy):
         self.n_layers = n_layers
         self.n_heads = n_heads
         self.dropout = dropout
+        self.timestep_embedding = timestep_embedding
         self.weight_decay = weight_decay
         self.clip_return_to_go = clip_return_to_go
         self.ema = ema
@@ -123,7 +126,8 @@ class SequencePolicy(BasePolicy):
         self._context: Context | None = None
         self._keys_values = KeysValuesCache()
 
-        trunk = SequenceTrunk(self.observation_dim, self.action_dim, max_timestep, embed_dim, n_layers, n_heads, dropout)
+        dims = (self.observation_dim, self.action_dim)
+        trunk = SequenceTrunk(*dims, max_timestep, embed_dim, n_layers, n_heads, dropout, timestep_embedding)
         self.network = SequenceNetwork(trunk, self._make_head(), self._make_auxiliary_head())
         self.ema_network = copy.deepcopy(self.network).requires_grad_(False) if ema else None
         self.optimizer = self._make_optimizer(lr_schedule(1.0))
@@ -393,6 +397,7 @@ class SequencePolicy(BasePolicy):
             "n_layers",
             "n_heads",
             "dropout",
+            "timestep_embedding",
             "weight_decay",
             "clip_return_to_go",
             "ema",

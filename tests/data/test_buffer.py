@@ -67,6 +67,20 @@ def test_windows_end_at_every_step_with_equal_probability():
     assert batch.mask[:, -1].all()
 
 
+def test_windows_end_near_an_episode_s_start_as_often_as_the_exponent_says():
+    """Of T steps, the first s hold a share of (s / T)^(1 / e); each episode keeps its share of all."""
+    buffer = make_buffer([100, 300, 1]).select(np.array([1, 2, 0]))
+    n_draws = 40_000
+    ends = buffer.draw(n_draws, th.Generator().manual_seed(5), timestep_exponent=2.0)
+    episodes = np.searchsorted([300, 301], ends.numpy(), side="right")
+    assert np.bincount(episodes) / n_draws == pytest.approx([300 / 401, 1 / 401, 100 / 401], abs=0.01)
+    for episode, length, first in ((0, 300, 0), (2, 100, 301)):
+        timesteps = ends.numpy()[episodes == episode] - first
+        assert timesteps.max() == length - 1
+        for share in (0.01, 0.04, 0.25, 0.64):
+            assert np.mean(timesteps < share * length) == pytest.approx(share**0.5, abs=0.02)
+
+
 def test_sampling_repeats_with_the_same_seed():
     buffer = make_buffer([10, 10])
     first, second = (buffer.sample(32, 5, th.Generator().manual_seed(3)) for _ in range(2))

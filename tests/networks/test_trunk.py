@@ -9,10 +9,15 @@ from sb3_dtfm.networks.trunk import SequenceTrunk, causal_mask
 B, K, OBSERVATION_DIM, A = 3, 6, 5, 2
 
 
-@pytest.fixture
-def trunk() -> SequenceTrunk:
+def make_trunk(timestep_embedding: bool) -> SequenceTrunk:
     th.manual_seed(0)
-    return SequenceTrunk(OBSERVATION_DIM, A, max_timestep=50, embed_dim=16, n_layers=2, n_heads=2, dropout=0.0)
+    sizes = dict(max_timestep=50, embed_dim=16, n_layers=2, n_heads=2)
+    return SequenceTrunk(OBSERVATION_DIM, A, **sizes, dropout=0.0, timestep_embedding=timestep_embedding)
+
+
+@pytest.fixture(params=[True, False], ids=["timesteps", "no timesteps"])
+def trunk(request) -> SequenceTrunk:
+    return make_trunk(request.param)
 
 
 @pytest.fixture
@@ -35,9 +40,14 @@ def changed_steps(trunk, window, name, step):
     return [k for k in range(K) if not th.allclose(before[:, k], trunk(**moved)[:, k], atol=1e-6)]
 
 
-@pytest.mark.parametrize("name", ["observations", "returns_to_go", "timesteps"])
+@pytest.mark.parametrize("name", ["observations", "returns_to_go"])
 def test_a_hidden_state_sees_its_own_step_and_everything_before(trunk, window, name):
     assert changed_steps(trunk, window, name, 2) == [2, 3, 4, 5]
+
+
+@pytest.mark.parametrize(("timestep_embedding", "changed"), [(True, [2, 3, 4, 5]), (False, [])])
+def test_time_steps_are_seen_where_they_have_embeddings(timestep_embedding, changed, window):
+    assert changed_steps(make_trunk(timestep_embedding), window, "timesteps", 2) == changed
 
 
 def test_an_action_is_seen_from_the_next_step_on(trunk, window):
