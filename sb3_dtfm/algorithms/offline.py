@@ -327,10 +327,10 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         self.policy.set_training_mode(True)  # an evaluation in between leaves evaluation mode on
         self._update_learning_rate(self.policy.optimizer)
         self.policy.optimizer.zero_grad(set_to_none=True)  # before the loss, which has the most in memory
-        batch = buffer.windows(ends, self.policy.window_length)
+        batch = buffer.windows(ends, self.context_length)
         loss, parts = parallel.compute_loss(batch, *self.policy.draw_noise(batch, generator))
         next_ends = buffer.draw(self.batch_size, generator, self.timestep_exponent)
-        buffer.prefetch(next_ends, self.policy.window_length)
+        buffer.prefetch(next_ends, self.context_length)
         loss.backward()
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.clipped_parameters(), self.max_grad_norm or math.inf)
         self.policy.optimizer.step()
@@ -391,7 +391,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         """`train/action_mse` on windows of the training data that belong to the step, so that it disturbs nothing."""
         assert self.buffer is not None
         generator = th.Generator(self.device).manual_seed(self.num_timesteps)
-        batch = self.buffer.sample(self.batch_size, self.policy.window_length, generator)
+        batch = self.buffer.sample(self.batch_size, self.context_length, generator)
         return float(self.policy.action_mse(batch, generator))
 
     def save(

@@ -8,12 +8,10 @@ from torch import nn
 
 from sb3_dtfm.networks.flow import ONE_STEP, check_solver
 from sb3_dtfm.networks.heads import FlowHead, RegressionHead
-from sb3_dtfm.policies.sequence import SequenceNetwork, SequencePolicy, SequenceTensors, standard_normal
+from sb3_dtfm.policies.sequence import SequenceNetwork, SequencePolicy, standard_normal
 
 # Rows of the table that deterministic acting takes its noise from.
 NOISE_ROWS = 1024
-# What stands for a return-to-go that is hidden; scaled ones of the tasks here are not negative.
-NO_RETURN = -1.0
 # Newest steps of each window that the one-step network learns from: where acting asks it, and few enough to cost little.
 ONE_STEP_POSITIONS = 4
 
@@ -39,12 +37,6 @@ class DTFMPolicy(SequencePolicy):
     :param one_step: train that network; a few percent of a gradient step, no influence on the rest
     :param regression_coef: weight of the auxiliary action regression; 0 leaves it out
 
-    :param observation_noise: standard deviation of Gaussian noise on normalised observations of the loss (an experiment)
-    :param return_to_go_dropout: share of windows whose return-to-go is hidden from the loss (an experiment)
-    :param guidance: w of a = a_without + w (a_with - a_without) a return-to-go (Ho and Salimans, 2022; an experiment)
-    :param action_chunk: H actions that one flow gives and that are carried out one after the other, whatever is observed
-        meanwhile (Zhao et al., 2023; an experiment)
-
     The other parameters are those of :class:`SequencePolicy`.
     """
 
@@ -62,10 +54,6 @@ class DTFMPolicy(SequencePolicy):
         n_solver_steps: int = 50,
         one_step: bool = True,
         regression_coef: float = 0.0,
-        observation_noise: float = 0.0,
-        return_to_go_dropout: float = 0.0,
-        guidance: float = 1.0,
-        action_chunk: int = 1,
         **kwargs: Any,
     ) -> None:
         self.flow_hidden_dim = flow_hidden_dim
@@ -81,27 +69,14 @@ class DTFMPolicy(SequencePolicy):
         self.n_solver_steps = n_solver_steps
         self.one_step = one_step
         self.regression_coef = regression_coef
-        self.observation_noise = observation_noise
-        self.return_to_go_dropout = return_to_go_dropout
-        self.guidance = guidance
-        self.action_chunk = action_chunk
-        self._chunk = th.zeros(0)
         super().__init__(*args, **kwargs)
         noise_generator = th.Generator().manual_seed(0 if self.seed is None else self.seed)
-        self.register_buffer("noise_table", standard_normal(NOISE_ROWS, self.chunk_dim, noise_generator))
+        self.register_buffer("noise_table", standard_normal(NOISE_ROWS, self.action_dim, noise_generator))
         self._acting_generator: th.Generator | None = None
-
-    @property
-    def chunk_dim(self) -> int:
-        return self.action_dim * self.action_chunk
-
-    @property
-    def window_length(self) -> int:
-        return self.context_length + self.action_chunk - 1
 
     def _make_head(self) -> FlowHead:
         self._check_solver(self.solver, self.n_solver_steps)
-        sizes = (self.embed_dim, self.chunk_dim, self.flow_hidden_dim, self.flow_n_layers)
+        sizes = (self.embed_dim, self.action_dim, self.flow_hidden_dim, self.flow_n_layers)
         return FlowHead(*sizes, self.one_step, self.flow_prediction)
 
     @staticmethod
@@ -113,30 +88,18 @@ class DTFMPolicy(SequencePolicy):
         return RegressionHead(self.embed_dim, self.action_dim) if self.regression_coef > 0 else None
 
     def draw_noise(self, batch: Any, generator: th.Generator) -> tuple[th.Tensor, ...]:
-        n_rows, length, _ = batch.actions.shape
-        length -= self.action_chunk - 1
+        n_rows, length, action_dim = batch.actions.shape
         shape, device = (n_rows, self.n_flow_draws, length), batch.actions.device
-        noise = th.randn(*shape, self.chunk_dim, generator=generator, device=device)
+        noise = th.randn(*shape, action_dim, generator=generator, device=device)
         tau = th.rand(shape, generator=generator, device=device) ** self.flow_tau_exponent
-        shift = self.observation_noise * th.randn(
-            n_rows, length, self.observation_dim, generator=generator, device=device
-        )
-        hidden = th.rand(n_rows, generator=generator, device=device) < self.return_to_go_dropout
-        return noise, tau, shift, hidden
+        return noise, tau
 
     def compute_loss(self, batch: Any, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        starts, tau, shift, no_return = noise
+        starts, tau = noise
         windows = self.scaled_windows(batch)
-        targets = windows.actions.unfold(1, self.action_chunk, 1).transpose(2, 3).flatten(2)
-        windows = SequenceTensors(*(x[:, : self.context_length] for x in windows))
-        seen = self._normalized(windows)
-        seen = seen._replace(
-            observations=seen.observations + shift,
-            returns_to_go=seen.returns_to_go.masked_fill(no_return.unsqueeze(1), NO_RETURN),
-        )
-        hidden = self.network.trunk(*seen)
+        hidden = self.hidden_states(self.network, windows)
         head = self._head(self.network)
-        parts = {"flow_loss": head.loss(hidden, targets, windows.mask, starts, tau)}
+        parts = {"flow_loss": head.loss(hidden, windows.actions, windows.mask, starts, tau)}
         loss = parts["flow_loss"]
         if self.network.auxiliary_head is not None:
             parts["regression_loss"] = self.network.auxiliary_head.loss(hidden, windows.actions, windows.mask)
@@ -155,36 +118,7 @@ class DTFMPolicy(SequencePolicy):
         return [p for name, p in self.network.named_parameters() if not name.startswith("head.jump")]
 
     def _generate(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
-        actions = self._head(self.acting_network)(hidden[:, : self.embed_dim], noise, self.solver, self.n_solver_steps)
-        if self.guidance != 1.0:
-            without = self._head(self.acting_network)(hidden[:, self.embed_dim :], noise, self.solver, self.n_solver_steps)
-            actions = without + self.guidance * (actions - without)
-        if self.action_chunk > 1:
-            chunk = actions.unflatten(1, (self.action_chunk, self.action_dim))
-            if len(self._chunk) != len(chunk):
-                self._chunk = chunk.clone()
-            position = self._timestep % self.action_chunk
-            self._chunk = th.where((position == 0)[:, None, None], chunk, self._chunk)
-            actions = self._chunk[th.arange(len(chunk)), position]
-        return actions
-
-    def hidden_states(self, network: SequenceNetwork, windows: SequenceTensors, last_only: bool = False) -> th.Tensor:
-        seen = self._normalized(windows)
-        hidden = network.trunk(*seen, last_only)
-        self._timestep = windows.timesteps[:, -1]
-        if self.guidance == 1.0:
-            return hidden
-        without = network.trunk(*seen._replace(returns_to_go=th.full_like(seen.returns_to_go, NO_RETURN)), last_only)
-        return th.cat((hidden, without), dim=-1)
-
-    def action_mse(self, batch: Any, generator: th.Generator) -> th.Tensor:
-        self.set_training_mode(False)
-        with th.no_grad():
-            windows = SequenceTensors(*(x[:, : self.context_length] for x in self.scaled_windows(batch)))
-            hidden = self.hidden_states(self.acting_network, windows, last_only=True).squeeze(1)
-            noise = standard_normal(len(hidden), self.chunk_dim, generator)
-            actions = self._head(self.acting_network)(hidden[:, : self.embed_dim], noise, self.solver, self.n_solver_steps)
-            return (actions[:, : self.action_dim].clamp(-1.0, 1.0) - windows.actions[:, -1]).square().mean()
+        return self._head(self.acting_network)(hidden, noise, self.solver, self.n_solver_steps)
 
     def _check_solver(self, solver: str, n_solver_steps: int) -> None:
         check_solver(solver, n_solver_steps)
@@ -212,14 +146,13 @@ class DTFMPolicy(SequencePolicy):
                 self._acting_generator.seed()
             else:
                 self._acting_generator.manual_seed(self.seed)
-        return standard_normal(len(timestep), self.chunk_dim, self._acting_generator)
+        return standard_normal(len(timestep), self.action_dim, self._acting_generator)
 
     def _acting_settings(self) -> dict[str, Any]:
         return {**super()._acting_settings(), "solver": self.solver, "n_solver_steps": self.n_solver_steps}
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         flow_names = ("flow_hidden_dim", "flow_n_layers", "flow_prediction", "flow_tau_exponent", "n_flow_draws")
-        experiments = ("observation_noise", "return_to_go_dropout", "guidance", "action_chunk")
-        names = (*flow_names, *experiments, "one_step", "regression_coef")
+        names = (*flow_names, "one_step", "regression_coef")
         own = {name: getattr(self, name) for name in names}
         return {**super()._get_constructor_parameters(), **own, **self._acting_settings()}

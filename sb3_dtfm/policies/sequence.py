@@ -133,11 +133,6 @@ class SequencePolicy(BasePolicy):
         self.optimizer = self._make_optimizer(lr_schedule(1.0))
 
     @property
-    def window_length(self) -> int:
-        """Steps of the windows that the loss learns from."""
-        return self.context_length
-
-    @property
     def acting_network(self) -> SequenceNetwork:
         """The weights that choose actions: the moving average if there is one."""
         return self.network if self.ema_network is None else self.ema_network
