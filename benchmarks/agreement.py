@@ -5,8 +5,8 @@ How near trained models' actions are to those of the agent that was recorded, ha
         --dataset local/walker2d/expert-v0 --fraction 0.5
 
 Models are told apart by `/dt/` and `/dtfm/` in their paths, where `sb3-dtfm train` and `benchmark` put them. Prints the root
-mean square of the difference, in units of [-1, 1], at the last step of windows: of episodes learned from, and of the others.
-And the share of the recorded numbers that lie at a bound of their action.
+mean square of the difference, in units of [-1, 1], at the last step of windows: of episodes learned from, and of the others;
+anywhere, and among the first steps of episodes. And the share of the recorded numbers that lie at a bound of their action.
 """
 
 import argparse
@@ -21,6 +21,8 @@ from sb3_dtfm.data.record_agent import load_agent
 from sb3_dtfm.zoo.registration import OFFLINE_ALGORITHMS
 
 N_WINDOWS = 4096
+# So long do the locomotion tasks' agents take to find their gait.
+N_FIRST_STEPS = 40
 
 
 def split(buffer: TrajectoryBuffer, fraction: float, seed: int) -> dict[str, TrajectoryBuffer]:
@@ -28,6 +30,16 @@ def split(buffer: TrajectoryBuffer, fraction: float, seed: int) -> dict[str, Tra
     learned = buffer.random_fraction(fraction, seed)
     others = np.flatnonzero(~np.isin(buffer.episodes.starts, learned.episodes.starts))
     return {"learned": learned} | ({"held out": buffer.select(others)} if len(others) else {})
+
+
+def window_ends(buffer: TrajectoryBuffer) -> dict[str, th.Tensor]:
+    """Where windows end: anywhere, and among the first steps of episodes."""
+    generator = th.Generator().manual_seed(0)
+    first = th.nonzero(buffer.timesteps < N_FIRST_STEPS).squeeze(1)
+    return {
+        "anywhere": buffer.draw(N_WINDOWS, generator),
+        f"first {N_FIRST_STEPS} steps": first[th.randint(len(first), (N_WINDOWS,), generator=generator)],
+    }
 
 
 def share_at_bounds(buffer: TrajectoryBuffer) -> float:
@@ -60,14 +72,16 @@ def main() -> None:
     for path in options.models:
         policy = algorithm_of(path).load(path, device="cpu").policy
         for name, buffer in parts.items():
-            batch = buffer.sample(N_WINDOWS, policy.context_length, th.Generator().manual_seed(0))
-            wanted, _ = agent.predict(batch.observations[:, -1].numpy(), deterministic=True)
-            generator = th.Generator().manual_seed(0)
-            errors = {}
-            for whose, actions in (("the agent's", th.as_tensor(wanted)), ("the recorded", batch.actions[:, -1])):
-                target = batch._replace(actions=th.cat((batch.actions[:, :-1], actions.unsqueeze(1)), dim=1))
-                errors[whose] = policy.action_mse(target, generator) ** 0.5
-            print(f"{path}: {name}: " + ", ".join(f"{error:.4f} from {whose}" for whose, error in errors.items()))
+            for where, ends in window_ends(buffer).items():
+                batch = buffer.windows(ends, policy.context_length)
+                wanted, _ = agent.predict(batch.observations[:, -1].numpy(), deterministic=True)
+                generator = th.Generator().manual_seed(0)
+                errors = {}
+                for whose, actions in (("the agent's", th.as_tensor(wanted)), ("the recorded", batch.actions[:, -1])):
+                    target = batch._replace(actions=th.cat((batch.actions[:, :-1], actions.unsqueeze(1)), dim=1))
+                    errors[whose] = policy.action_mse(target, generator) ** 0.5
+                report = ", ".join(f"{error:.4f} from {whose}" for whose, error in errors.items())
+                print(f"{path}: {name}, {where}: {report}")
 
 
 if __name__ == "__main__":
