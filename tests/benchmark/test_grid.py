@@ -173,7 +173,7 @@ def test_the_packaged_profiles_differ_in_the_head_only(profile, env_id):
     dt, dtfm = (task_settings(profile, algo, Task(env_id), 0.5, None, {}) for algo in ("dt", "dtfm"))
     own = {"flow_hidden_dim", "flow_n_layers", "solver", "n_solver_steps"}
     if profile == "small":
-        own |= {"flow_prediction", "one_step"} | ({"flow_tau_exponent"} if env_id.endswith("-v5") else set())
+        own |= {"flow_prediction", "flow_tau_exponent", "one_step"}
     assert set(dtfm["policy_kwargs"]) - set(dt["policy_kwargs"]) == own
     dtfm["policy_kwargs"] = {key: value for key, value in dtfm["policy_kwargs"].items() if key not in own}
     assert dt == dtfm
