@@ -204,21 +204,19 @@ def logged_learning_rates(model, n_steps):
     return rates
 
 
-def test_several_flow_draws_and_action_prediction_train_and_are_saved(cheetah_buffer, tmp_path):
-    policy_kwargs = {**TINY_FLOW_POLICY, "n_flow_draws": 3, "flow_prediction": "action", "flow_tau_exponent": 2.0}
+def test_action_prediction_and_tau_near_the_noise_train_and_are_saved(cheetah_buffer, tmp_path):
+    policy_kwargs = {**TINY_FLOW_POLICY, "flow_prediction": "action", "flow_tau_exponent": 2.0}
     model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, context_length=3, policy_kwargs=policy_kwargs, seed=0)
     batch = model.buffer.sample(4, 3, th.Generator().manual_seed(0))
     noise, tau = model.policy.draw_noise(batch, th.Generator().manual_seed(0))
-    assert (noise.shape, tau.shape) == ((4, 3, 3, 6), (4, 3, 3))
+    assert (noise.shape, tau.shape) == ((4, 3, 6), (4, 3))
     model.policy.flow_tau_exponent = 1.0
     _, uniform = model.policy.draw_noise(batch, th.Generator().manual_seed(0))
     th.testing.assert_close(tau, uniform.square())
     model.policy.flow_tau_exponent = 2.0
     model.learn(3).save(tmp_path / "model")
     policy = DTFM.load(tmp_path / "model").policy
-    assert (policy.n_flow_draws, policy.flow_prediction, policy.flow_tau_exponent) == (3, "action", 2.0)
-    with pytest.raises(ValueError, match="n_flow_draws must be at least 1, got 0"):
-        DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs={**TINY_FLOW_POLICY, "n_flow_draws": 0})
+    assert (policy.flow_prediction, policy.flow_tau_exponent) == ("action", 2.0)
     with pytest.raises(ValueError, match="flow_tau_exponent must be positive and finite, got 0"):
         DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs={**TINY_FLOW_POLICY, "flow_tau_exponent": 0})
 

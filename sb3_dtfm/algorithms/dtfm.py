@@ -14,8 +14,8 @@ class DTFM(OfflineSequenceAlgorithm):
     """
     Decision Transformer with flow matching: the trunk's hidden state conditions a vector field from noise to action.
 
-    `policy_kwargs` also takes `flow_hidden_dim`, `flow_n_layers`, `flow_prediction`, `flow_tau_exponent`, `n_flow_draws`,
-    `solver`, `n_solver_steps` and `one_step`.
+    `policy_kwargs` also takes `flow_hidden_dim`, `flow_n_layers`, `flow_prediction`, `flow_tau_exponent`, `solver`,
+    `n_solver_steps` and `one_step`.
 
     :param regression_coef: weight of an auxiliary action regression from the hidden state; 0 leaves it out
 

@@ -51,7 +51,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
     :param context_length: K, steps the policy sees
     :param dataset_fraction: share of the episodes to learn from, randomly drawn
     :param dataset_seed: seed of that draw alone, so that different runs learn from the same episodes
-    :param timestep_exponent: the windows of a gradient step end at time step T u^e of an episode of T steps, for u uniform in
+    :param timestep_exponent: e of the time step T u^e at which windows end in an episode of T steps, for u uniform in
         [0, 1]: above 1 an episode's start, of which there is little in long episodes, is learned from more often
     :param dataset_kwargs: further arguments of :func:`~sb3_dtfm.data.load_dataset`: `{"cache_dir": folder}` for datasets
         larger than memory, and the reader's own, for example `{"filter_key": "train"}` for robomimic

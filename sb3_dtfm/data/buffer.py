@@ -247,9 +247,7 @@ class TrajectoryBuffer:
         """
         return self.windows(self.draw(batch_size, generator), context_length)
 
-    def draw(
-        self, batch_size: int, generator: th.Generator | None = None, timestep_exponent: float = 1.0
-    ) -> th.Tensor:
+    def draw(self, batch_size: int, generator: th.Generator | None = None, timestep_exponent: float = 1.0) -> th.Tensor:
         """
         The random part of :meth:`sample`: what to give to :meth:`windows`.
 

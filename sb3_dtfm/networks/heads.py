@@ -99,19 +99,15 @@ class FlowHead(nn.Module):
         :param hidden: (B, K, D)
         :param actions: (B, K, A) in [-1, 1]
         :param mask: (B, K) bool
-        :param noise: (B, n, K, A), standard normal: n draws for each hidden state
-        :param tau: (B, n, K) in [0, 1]
-        :return: mean squared error over valid steps and draws
+        :param noise: (B, K, A), standard normal
+        :param tau: (B, K) in [0, 1]
+        :return: mean squared error over valid steps
         """
-        actions = actions.unsqueeze(1)
         x, velocity = interpolate(noise, actions, tau.unsqueeze(-1))
-        film = self.vector_field.film_condition(hidden).unsqueeze(1) + self.vector_field.time_share(tau)
+        film = self.vector_field.film_condition(hidden) + self.vector_field.time_share(tau)
         output = self.vector_field(x, film)
-        if self.regression is None:
-            error = output - velocity
-        else:
-            error = (self.regression(hidden).unsqueeze(1) + output).tanh() - actions
-        return masked_mean(error.square(), mask.unsqueeze(1).expand(tau.shape))
+        error = output - velocity if self.regression is None else (self.regression(hidden) + output).tanh() - actions
+        return masked_mean(error.square(), mask)
 
     def one_step_loss(self, hidden: th.Tensor, mask: th.Tensor, noise: th.Tensor) -> th.Tensor:
         """

@@ -31,7 +31,6 @@ class DTFMPolicy(SequencePolicy):
         by tanh, from which the velocity follows
     :param flow_tau_exponent: tau of the loss is u to this power for u uniform in [0, 1]: above 1 it is more often near the
         noise, where the action has to come from the hidden state
-    :param n_flow_draws: pairs of noise and tau for each hidden state and gradient step: the head is cheap beside the trunk
     :param solver: how to act: an ODE solver, euler, midpoint, heun or rk4; or one_step, the network that learnt its end
     :param n_solver_steps: steps of the ODE solver
     :param one_step: train that network; a few percent of a gradient step, no influence on the rest
@@ -49,7 +48,6 @@ class DTFMPolicy(SequencePolicy):
         flow_n_layers: int = 3,
         flow_prediction: str = "velocity",
         flow_tau_exponent: float = 1.0,
-        n_flow_draws: int = 1,
         solver: str = "euler",
         n_solver_steps: int = 50,
         one_step: bool = True,
@@ -62,9 +60,6 @@ class DTFMPolicy(SequencePolicy):
         if not 0.0 < flow_tau_exponent < math.inf:
             raise ValueError(f"flow_tau_exponent must be positive and finite, got {flow_tau_exponent}.")
         self.flow_tau_exponent = flow_tau_exponent
-        if n_flow_draws < 1:
-            raise ValueError(f"n_flow_draws must be at least 1, got {n_flow_draws}.")
-        self.n_flow_draws = n_flow_draws
         self.solver = solver
         self.n_solver_steps = n_solver_steps
         self.one_step = one_step
@@ -88,10 +83,9 @@ class DTFMPolicy(SequencePolicy):
         return RegressionHead(self.embed_dim, self.action_dim) if self.regression_coef > 0 else None
 
     def draw_noise(self, batch: Any, generator: th.Generator) -> tuple[th.Tensor, ...]:
-        n_rows, length, action_dim = batch.actions.shape
-        shape, device = (n_rows, self.n_flow_draws, length), batch.actions.device
-        noise = th.randn(*shape, action_dim, generator=generator, device=device)
-        tau = th.rand(shape, generator=generator, device=device) ** self.flow_tau_exponent
+        shape, device = batch.actions.shape, batch.actions.device
+        noise = th.randn(shape, generator=generator, device=device)
+        tau = th.rand(shape[:2], generator=generator, device=device) ** self.flow_tau_exponent
         return noise, tau
 
     def compute_loss(self, batch: Any, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
@@ -106,7 +100,7 @@ class DTFMPolicy(SequencePolicy):
             loss = loss + self.regression_coef * parts["regression_loss"]
         if self.one_step:
             newest = slice(-ONE_STEP_POSITIONS, None)
-            parts["one_step_loss"] = head.one_step_loss(hidden[:, newest], windows.mask[:, newest], starts[:, 0, newest])
+            parts["one_step_loss"] = head.one_step_loss(hidden[:, newest], windows.mask[:, newest], starts[:, newest])
             loss = loss + parts["one_step_loss"]
         return loss, parts
 
@@ -152,7 +146,7 @@ class DTFMPolicy(SequencePolicy):
         return {**super()._acting_settings(), "solver": self.solver, "n_solver_steps": self.n_solver_steps}
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        flow_names = ("flow_hidden_dim", "flow_n_layers", "flow_prediction", "flow_tau_exponent", "n_flow_draws")
+        flow_names = ("flow_hidden_dim", "flow_n_layers", "flow_prediction", "flow_tau_exponent")
         names = (*flow_names, "one_step", "regression_coef")
         own = {name: getattr(self, name) for name in names}
         return {**super()._get_constructor_parameters(), **own, **self._acting_settings()}
