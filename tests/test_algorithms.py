@@ -225,7 +225,13 @@ def test_action_prediction_and_tau_near_the_noise_train_and_are_saved(cheetah_bu
 def test_without_time_steps_and_with_more_starts(algorithm, policy_kwargs, cheetah_buffer, tmp_path):
     policy_kwargs = {**policy_kwargs, "timestep_embedding": False}
     model = make_model(algorithm, cheetah_buffer, policy_kwargs=policy_kwargs, timestep_exponent=1.5)
-    model.learn(3).save(tmp_path / "model")
+    drawn = []
+    model.buffer.windows = lambda ends, length, windows=model.buffer.windows: drawn.append(ends) or windows(ends, length)
+    model.learn(50, log_interval=None).save(tmp_path / "model")
+    timesteps = model.buffer.timesteps[th.cat(drawn)]
+    (length,) = set(model.buffer.episode_lengths)
+    assert len(timesteps) == 50 * 16
+    assert (timesteps < 0.25 * length).float().mean() == pytest.approx(0.25 ** (1 / 1.5), abs=0.05)
     loaded = algorithm.load(tmp_path / "model")
     assert loaded.timestep_exponent == 1.5
     assert loaded.policy.network.trunk.embed_timestep is None
