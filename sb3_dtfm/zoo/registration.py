@@ -16,8 +16,21 @@ OFFLINE_ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"dt": DT, "dtfm": DTFM}
 # What `--conf-file` accepts besides files and Python packages; None is no `--conf-file` at all.
 PACKAGED_CONFIGS = {None: "sb3_dtfm.zoo_configs", "small": "sb3_dtfm.zoo_configs.small"}
 
-# Everything a trial changes inside `policy_kwargs`; RL-Zoo lets a trial's `policy_kwargs` replace the YAML's as a whole.
-_POLICY_KEYS = ("embed_dim", "n_layers", "n_heads", "dropout", "flow_hidden_dim", "flow_n_layers", "n_solver_steps")
+# Everything a trial changes inside `policy_kwargs`. RL-Zoo lets a trial's `policy_kwargs` replace the YAML's as a whole, so
+# the search covers all that the packaged settings choose there.
+_POLICY_KEYS = (
+    "embed_dim",
+    "n_layers",
+    "n_heads",
+    "dropout",
+    "timestep_embedding",
+    "clip_return_to_go",
+    "flow_hidden_dim",
+    "flow_n_layers",
+    "flow_prediction",
+    "flow_tau_exponent",
+    "n_solver_steps",
+)
 
 
 def register() -> None:
@@ -76,8 +89,9 @@ def sample_dtfm_params(trial: optuna.Trial, n_actions: int, n_envs: int, additio
     flow = {
         "flow_hidden_dim_pow": trial.suggest_int("flow_hidden_dim_pow", 7, 9),
         "flow_n_layers": trial.suggest_int("flow_n_layers", 2, 4),
-        "n_solver_steps": trial.suggest_categorical("n_solver_steps", [5, 10, 20, 50]),
-        "regression_coef": trial.suggest_categorical("regression_coef", [0.0, 0.1, 1.0]),
+        "flow_prediction": trial.suggest_categorical("flow_prediction", ["velocity", "action"]),
+        "flow_tau_exponent": trial.suggest_categorical("flow_tau_exponent", [1.0, 2.0]),
+        "n_solver_steps": trial.suggest_categorical("n_solver_steps", [1, 3, 10, 50]),
     }
     return convert_params({**_sample_trunk(trial), **flow})
 
@@ -85,13 +99,15 @@ def sample_dtfm_params(trial: optuna.Trial, n_actions: int, n_envs: int, additio
 def _sample_trunk(trial: optuna.Trial) -> dict[str, Any]:
     """What both algorithms share: optimiser, context and Transformer."""
     return {
-        "learning_rate": trial.suggest_float("learning_rate", 3e-5, 1e-3, log=True),
+        "learning_rate": trial.suggest_float("learning_rate", 3e-5, 3e-3, log=True),
         "batch_size_pow": trial.suggest_int("batch_size_pow", 5, 8),
         "weight_decay": trial.suggest_float("weight_decay", 1e-5, 1e-1, log=True),
         "ema_decay": trial.suggest_categorical("ema_decay", [0.0, 0.99, 0.999]),
         "context_length": trial.suggest_categorical("context_length", [5, 10, 20, 50]),
         "embed_dim_pow": trial.suggest_int("embed_dim_pow", 6, 8),
-        "n_layers": trial.suggest_int("n_layers", 2, 6),
+        "n_layers": trial.suggest_int("n_layers", 2, 10),
         "n_heads_pow": trial.suggest_int("n_heads_pow", 0, 2),
         "dropout": trial.suggest_float("dropout", 0.0, 0.3),
+        "timestep_embedding": trial.suggest_categorical("timestep_embedding", [True, False]),
+        "clip_return_to_go": trial.suggest_categorical("clip_return_to_go", [True, False]),
     }

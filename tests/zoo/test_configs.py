@@ -4,12 +4,14 @@ import copy
 
 import gymnasium as gym
 import numpy as np
+import optuna
 import pytest
 import yaml
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import get_wrapper_class
 
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
-from sb3_dtfm.zoo.registration import OFFLINE_ALGORITHMS, packaged_config
+from sb3_dtfm.zoo.registration import OFFLINE_ALGORITHMS, packaged_config, register
 
 TARGETS = {
     "HalfCheetah-v5": 20000,
@@ -105,3 +107,21 @@ def test_the_papers_settings():
         "learning_rate_schedule": "constant",
         "weight_decay": 1e-3,
     }
+
+
+@pytest.mark.filterwarnings("error")  # Optuna only warns of a value outside of the range
+@pytest.mark.parametrize("settings", SETTINGS)
+@pytest.mark.parametrize("algo", OFFLINE_ALGORITHMS)
+def test_a_search_can_find_the_packaged_settings(algo, settings):
+    """A trial's `policy_kwargs` replace the YAML's, so what the search leaves out there would be lost."""
+    register()
+    unset = {"clip_return_to_go": False, "timestep_embedding": True, "flow_prediction": "velocity", "flow_tau_exponent": 1.0}
+    for hyperparams in load(algo, settings).values():
+        policy_kwargs = copy.copy(hyperparams["policy_kwargs"])
+        for key in {"solver", "one_step"} & set(policy_kwargs):  # ways of acting, not searched for
+            del policy_kwargs[key]
+        packaged = {"ema_decay": 0.0, **hyperparams, **unset, **policy_kwargs}
+        powers = {f"{key}_pow": int(np.log2(value)) for key, value in packaged.items() if type(value) is int}
+        sampled = HYPERPARAMS_SAMPLER[algo](optuna.trial.FixedTrial({**packaged, **powers}), 0, 1, {})
+        assert sampled.pop("policy_kwargs").items() >= policy_kwargs.items()
+        assert sampled.items() <= packaged.items()
