@@ -1,10 +1,13 @@
 """The `sb3-dtfm` command."""
 
 import argparse
+import contextlib
 import importlib.util
+import os
+import shutil
 import sys
 from collections.abc import Callable, Sequence
-from types import CodeType
+from types import CodeType, FrameType
 
 from gymnasium.error import Error as GymnasiumError
 
@@ -23,8 +26,12 @@ def train(argv: Sequence[str]) -> None:
     if {"-h", "--help"} & set(argv):
         train_parser().print_help()
         _run_with_arguments(zoo_train, "train", ["--help"])
-    with joined_processes(train_arguments(argv)) as arguments:
-        _run_with_arguments(zoo_train, "train", arguments)
+    try:
+        with joined_processes(train_arguments(argv)) as arguments:
+            _run_with_arguments(zoo_train, "train", arguments)
+    except BaseException as error:
+        _remove_folder_of_no_run(error)
+        raise
 
 
 def enjoy(argv: Sequence[str]) -> None:
@@ -155,13 +162,31 @@ def _raised_while_training(error: BaseException) -> bool:
     return _raised_inside(error, ExperimentManager.learn.__code__)
 
 
+def _remove_folder_of_no_run(error: BaseException) -> None:
+    """RL-Zoo makes a run's folder before its model: where that failed, `enjoy` would look there for the latest run."""
+    from rl_zoo3.exp_manager import ExperimentManager
+
+    frame = _frame_of(error, ExperimentManager.setup_experiment.__code__)
+    if frame is None:
+        return
+    manager = frame.f_locals["self"]
+    with contextlib.suppress(OSError):  # not made yet, or no longer empty: then it is a run's
+        os.rmdir(manager.params_path)
+        shutil.rmtree(manager.save_path)
+
+
 def _raised_inside(error: BaseException, code: CodeType) -> bool:
+    return _frame_of(error, code) is not None
+
+
+def _frame_of(error: BaseException, code: CodeType) -> FrameType | None:
+    """The call of this code that the error went through."""
     traceback = error.__traceback__
     while traceback is not None:
         if traceback.tb_frame.f_code is code:
-            return True
+            return traceback.tb_frame
         traceback = traceback.tb_next
-    return False
+    return None
 
 
 if __name__ == "__main__":

@@ -103,6 +103,7 @@ def test_a_mistake_ends_in_one_clear_line(arguments, message, workplace, capsys)
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert error.startswith(f"sb3-dtfm {arguments[0]}: error: ")
     assert message in error
+    assert not list(workplace.glob("logs/*/*")), "no folder where `enjoy` would look for a run"
 
 
 def test_debug_shows_the_traceback(workplace):
