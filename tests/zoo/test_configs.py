@@ -118,7 +118,7 @@ def test_a_search_can_find_the_packaged_settings(algo, settings):
     unset = {"clip_return_to_go": False, "timestep_embedding": True, "flow_prediction": "velocity", "flow_tau_exponent": 1.0}
     for hyperparams in load(algo, settings).values():
         policy_kwargs = copy.copy(hyperparams["policy_kwargs"])
-        for key in {"solver", "one_step"} & set(policy_kwargs):  # ways of acting, not searched for
+        for key in {"solver", "one_step"} & set(policy_kwargs):  # not searched for: neither changes what the rest learns
             del policy_kwargs[key]
         packaged = {"ema_decay": 0.0, **hyperparams, **unset, **policy_kwargs}
         powers = {f"{key}_pow": int(np.log2(value)) for key, value in packaged.items() if type(value) is int}
