@@ -22,9 +22,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.benchmark.evaluation import FINAL_STATES
-from sb3_dtfm.data.record_agent import check_dataset_id, write_dataset
-from sb3_dtfm.data.rollout import run_episodes
 from sb3_dtfm.envs import ReturnToGoWrapper
+from sb3_dtfm.recording.agent import check_dataset_id, write_dataset
+from sb3_dtfm.recording.episodes import run_episodes
 
 ENV_ID = "PointMaze_UMaze-v3"
 ENV_KWARGS = {

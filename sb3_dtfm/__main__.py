@@ -2,7 +2,7 @@
 
 import sys
 
-from sb3_dtfm.zoo.cli import main
+from sb3_dtfm.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

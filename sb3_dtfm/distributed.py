@@ -99,7 +99,7 @@ class DataParallel:
         """
         This process's part of the policy's loss: the mean over all processes is the loss of the whole batch.
 
-        :param batch: the whole :class:`~sb3_dtfm.data.SequenceBatch`, (B, K, ...)
+        :param batch: the whole :class:`~sb3_dtfm.windows.Windows`, (B, K, ...)
         :param noise: what the policy draws for the whole batch, each (B, ...)
         :return: the loss to minimise, whose gradient will be the whole batch's, and its parts by their logged names
         """

@@ -11,10 +11,11 @@ PACKAGE = "sb3_dtfm"
 # Room: its files, and the parts of the package that it may import.
 ROOMS = {
     "networks": ("sb3_dtfm/networks", {"networks"}),
-    "context": ("sb3_dtfm/context.py", set()),
+    "windows": ("sb3_dtfm/windows.py", set()),
     "envs": ("envs", {"envs"}),
-    "data": ("sb3_dtfm/data", {"data", "envs"}),
-    "policies": ("sb3_dtfm/policies", {"networks", "context", "policies"}),
+    "data": ("sb3_dtfm/data", {"data", "envs", "windows"}),
+    "recording": ("sb3_dtfm/recording", {"recording", "envs", "data"}),
+    "policies": ("sb3_dtfm/policies", {"networks", "windows", "policies"}),
     "callbacks": ("sb3_dtfm/callbacks.py", {"data"}),
     "optimization": ("sb3_dtfm/optimization.py", set()),
     "distributed": ("sb3_dtfm/distributed.py", set()),
@@ -22,8 +23,9 @@ ROOMS = {
         "sb3_dtfm/algorithms",
         {"algorithms", "policies", "data", "envs", "callbacks", "optimization", "distributed"},
     ),
-    "zoo": ("sb3_dtfm/zoo", {"", "data", "envs", "distributed", "zoo", "benchmark"}),
-    "benchmark": ("sb3_dtfm/benchmark", {"", "data", "zoo", "benchmark"}),
+    "zoo": ("sb3_dtfm/zoo", {"", "data", "envs", "distributed", "zoo"}),
+    "benchmark": ("sb3_dtfm/benchmark", {"", "data", "zoo", "benchmark", "cli"}),
+    "cli": ("sb3_dtfm/cli", {"", "data", "envs", "recording", "zoo", "benchmark", "cli"}),
 }
 
 

@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_dtfm.benchmark import provenance
 from sb3_dtfm.benchmark.evaluation import EvaluationCallback, SeededEpisodes
 from sb3_dtfm.benchmark.rows import write_row
-from sb3_dtfm.zoo import cli
+from sb3_dtfm.cli import main as cli
 
 ROWS, PROGRESS, OUTPUT, SPEC = "rows.jsonl", "progress.json", "output.log", "spec.json"
 

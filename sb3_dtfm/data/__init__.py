@@ -9,7 +9,7 @@ from typing import Any
 
 from minari import MinariDataset
 
-from sb3_dtfm.data.buffer import SequenceBatch, TrajectoryBuffer
+from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, load_cached
 from sb3_dtfm.data.episodes import Statistics
 from sb3_dtfm.data.minari import load_minari, open_minari
@@ -91,7 +91,6 @@ def _chosen_episodes(dataset: MinariDataset) -> str | list[int]:
 __all__ = [
     "DatasetError",
     "ScoreReference",
-    "SequenceBatch",
     "Statistics",
     "Trajectory",
     "TrajectoryBuffer",

@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch as th
@@ -11,24 +10,10 @@ from gymnasium import spaces
 from sb3_dtfm.data.episodes import EpisodeTable, Statistics, moments
 from sb3_dtfm.data.storage import STEP_ARRAYS, FileStorage, MappedSteps, MemoryStorage
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, check_trajectory, returns_to_go
+from sb3_dtfm.windows import Windows
 
 # A buffer moves to an accelerator if it takes at most this share of the memory that is free there.
 DEVICE_MEMORY_SHARE = 0.5
-
-
-class SequenceBatch(NamedTuple):
-    """
-    Windows of K consecutive steps, padded on the left; padded entries are zero and False in `mask`.
-
-    Shapes: observations (B, K, O), actions (B, K, A) in the environment's range, returns_to_go (B, K) in environment
-    reward units, timesteps (B, K) int64 counted from the episode's start, mask (B, K) bool.
-    """
-
-    observations: th.Tensor
-    actions: th.Tensor
-    returns_to_go: th.Tensor
-    timesteps: th.Tensor
-    mask: th.Tensor
 
 
 class TrajectoryBuffer:
@@ -237,7 +222,7 @@ class TrajectoryBuffer:
         moved._set_episodes(self.episodes)
         return moved
 
-    def sample(self, batch_size: int, context_length: int, generator: th.Generator | None = None) -> SequenceBatch:
+    def sample(self, batch_size: int, context_length: int, generator: th.Generator | None = None) -> Windows:
         """
         Windows that end at any step of any episode with equal probability.
 
@@ -277,9 +262,9 @@ class TrajectoryBuffer:
             for steps in self._maps:
                 steps.will_need(stops, context_length)
 
-    def windows(self, ends: th.Tensor, context_length: int) -> SequenceBatch:
+    def windows(self, ends: th.Tensor, context_length: int) -> Windows:
         """
-        The windows of K steps that end at the given steps.
+        The windows of K steps that end at the given steps, actions in the environment's range.
 
         :param ends: (B,) int64 positions among the buffer's own steps, episode after episode
         :param context_length: K
@@ -291,7 +276,7 @@ class TrajectoryBuffer:
         rows = (last_rows.unsqueeze(1) + back).clamp_(min=0).flatten()
         shape = (len(ends), context_length, -1)
         valid = mask.unsqueeze(-1)
-        batch = SequenceBatch(
+        batch = Windows(
             observations=self.observations.index_select(0, rows).view(shape) * valid,
             actions=self.actions.index_select(0, rows).view(shape) * valid,
             returns_to_go=self.returns_to_go.index_select(0, rows).view(mask.shape) * mask,
@@ -300,7 +285,7 @@ class TrajectoryBuffer:
         )
         if self.device.type == rows.device.type:
             return batch
-        return SequenceBatch(*(tensor.pin_memory().to(self.device, non_blocking=True) for tensor in batch))
+        return Windows(*(tensor.pin_memory().to(self.device, non_blocking=True) for tensor in batch))
 
     def _locate(self, positions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Rows in the flat tensors, and time steps, of positions among the buffer's own steps."""

@@ -3,7 +3,7 @@
 import copy
 import json
 from abc import abstractmethod
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -12,33 +12,14 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_dtfm.context import Context, empty_context, push, unpack_observation, with_action
 from sb3_dtfm.networks.heads import RegressionHead
 from sb3_dtfm.networks.linear import threads_for
 from sb3_dtfm.networks.trunk import SequenceTrunk
 from sb3_dtfm.policies.kv_cache import TOKENS_PER_STEP, KeysValuesCache
+from sb3_dtfm.windows import Context, Windows, empty_context, push, unpack_observation, with_action
 
 # Observations are clipped at this many standard deviations, as SB3's VecNormalize does.
 OBSERVATION_CLIP = 10.0
-
-
-class SequenceTensors(NamedTuple):
-    """
-    Windows on the policy's device: what :class:`~sb3_dtfm.data.SequenceBatch` and
-    :class:`~sb3_dtfm.context.Context` have in common.
-
-    Shapes: observations (B, K, O) as the environment gives them, actions (B, K, A) in [-1, 1], returns_to_go (B, K) in
-    environment reward units, timesteps (B, K) int64, mask (B, K) bool.
-    """
-
-    observations: th.Tensor
-    actions: th.Tensor
-    returns_to_go: th.Tensor
-    timesteps: th.Tensor
-    mask: th.Tensor
-
-
-N_WINDOWS = len(SequenceTensors._fields)  # so many fields of a context, its first ones
 
 
 class SequenceNetwork(nn.Module):
@@ -149,7 +130,7 @@ class SequencePolicy(BasePolicy):
         """
         What the loss draws at random, one row per window: drawn apart from it, so that the loss is a plain function.
 
-        :param batch: a :class:`~sb3_dtfm.data.SequenceBatch`
+        :param batch: a :class:`~sb3_dtfm.windows.Windows`
         :param generator: on the policy's device
         :return: further arguments of :meth:`compute_loss`, each (B, ...)
         """
@@ -167,7 +148,7 @@ class SequencePolicy(BasePolicy):
     @abstractmethod
     def compute_loss(self, batch: Any, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """
-        :param batch: a :class:`~sb3_dtfm.data.SequenceBatch`, actions in the environment's range
+        :param batch: a :class:`~sb3_dtfm.windows.Windows`, actions in the environment's range
         :param noise: what :meth:`draw_noise` gave for the batch
         :return: the loss to minimise, and its parts by their logged names
         """
@@ -220,7 +201,7 @@ class SequencePolicy(BasePolicy):
             return super().scale_action(action)
         return 2.0 * (action - self.action_low) / (self.action_high - self.action_low) - 1.0
 
-    def hidden_states(self, network: SequenceNetwork, windows: SequenceTensors, last_only: bool = False) -> th.Tensor:
+    def hidden_states(self, network: SequenceNetwork, windows: Windows, last_only: bool = False) -> th.Tensor:
         """
         Run the trunk on windows in environment units.
 
@@ -228,7 +209,7 @@ class SequencePolicy(BasePolicy):
         """
         return network.trunk(*self._normalized(windows), last_only)
 
-    def _normalized(self, windows: SequenceTensors) -> SequenceTensors:
+    def _normalized(self, windows: Windows) -> Windows:
         observations = (windows.observations - self.observation_mean) / self.observation_std
         returns_to_go = windows.returns_to_go
         if self.return_to_go_range is not None:
@@ -239,9 +220,9 @@ class SequencePolicy(BasePolicy):
             returns_to_go=returns_to_go / self.return_scale,
         )
 
-    def scaled_windows(self, batch: Any) -> SequenceTensors:
-        """The windows of a :class:`~sb3_dtfm.data.SequenceBatch`, with actions in [-1, 1]."""
-        return SequenceTensors(*batch)._replace(actions=self.scale_action(batch.actions))
+    def scaled_windows(self, batch: Any) -> Windows:
+        """The windows of a :class:`~sb3_dtfm.windows.Windows`, with actions in [-1, 1]."""
+        return batch._replace(actions=self.scale_action(batch.actions))
 
     def action_mse(self, batch: Any, generator: th.Generator) -> th.Tensor:
         """
@@ -249,7 +230,7 @@ class SequencePolicy(BasePolicy):
 
         The same measure for every head: what `predict` would do on recorded windows against what was recorded.
 
-        :param batch: a :class:`~sb3_dtfm.data.SequenceBatch`
+        :param batch: a :class:`~sb3_dtfm.windows.Windows`
         :param generator: source of the noise that actions start from
         """
         self.set_training_mode(False)
@@ -314,7 +295,7 @@ class SequencePolicy(BasePolicy):
             self.set_training_mode(False)  # goes through all modules
         device = self.device  # SB3 looks for it among the parameters each time
         with th.inference_mode():
-            windows = SequenceTensors(*(th.from_numpy(array).to(device) for array in context[:N_WINDOWS]))
+            windows = Windows(*(th.from_numpy(array).to(device) for array in context.windows))
             if self.kv_cache and self.context_length > 1:
                 hidden, keys_values = self._extend(self._normalized(windows), context.keys_values)
             else:
@@ -327,7 +308,7 @@ class SequencePolicy(BasePolicy):
                 actions = self._generate(hidden, noise).clamp(-1.0, 1.0)
             return actions.cpu().numpy(), keys_values
 
-    def _extend(self, windows: SequenceTensors, kept: np.ndarray) -> tuple[th.Tensor, np.ndarray]:
+    def _extend(self, windows: Windows, kept: np.ndarray) -> tuple[th.Tensor, np.ndarray]:
         """
         The newest hidden states from what was kept, and what to keep for the next step.
 
@@ -342,7 +323,7 @@ class SequencePolicy(BasePolicy):
             n_missing = int(windows.mask.sum(dim=1).max()) - 1
         with threads_for(TOKENS_PER_STEP * len(kept)):
             for n_back in range(n_missing, -1, -1):
-                earlier = SequenceTensors(*(x.roll(n_back, dims=1) for x in windows)) if n_back else windows
+                earlier = Windows(*(x.roll(n_back, dims=1) for x in windows)) if n_back else windows
                 earlier.mask[:, :n_back] = False  # the newest steps went round to the left
                 keys_values = self._keys_values.with_next_step(kept, earlier.mask.device)
                 hidden = self.acting_network.trunk.extend(*earlier, keys_values=keys_values)

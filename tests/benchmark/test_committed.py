@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sb3_dtfm.zoo.cli import main
+from sb3_dtfm.cli.main import main
 
 ROOT = Path(__file__).parents[2]
 

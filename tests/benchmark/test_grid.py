@@ -17,8 +17,8 @@ from sb3_dtfm.benchmark.display import PlainDisplay
 from sb3_dtfm.benchmark.grid import parse_arguments, plan, read_tasks
 from sb3_dtfm.benchmark.rows import read_rows
 from sb3_dtfm.benchmark.settings import Task, task_settings
+from sb3_dtfm.cli.main import main
 from sb3_dtfm.zoo.arguments import UsageError
-from sb3_dtfm.zoo.cli import main
 from tests.zoo.conftest import DATASET_ID
 
 TASK = "HalfCheetah-v5"

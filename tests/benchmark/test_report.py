@@ -8,7 +8,7 @@ import pytest
 
 from sb3_dtfm.benchmark.rows import Cell, merge_rows, result_files
 from sb3_dtfm.benchmark.runs import group_runs, learning_curve, paired_scores, spread, steps_to_success
-from sb3_dtfm.zoo.cli import main
+from sb3_dtfm.cli.main import main
 
 ROWS = Path(__file__).parent / "rows"
 LIFT, CHEETAH = "robosuite/Lift-v0", "HalfCheetah-v5"

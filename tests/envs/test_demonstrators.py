@@ -6,11 +6,11 @@ import h5py
 import numpy as np
 import pytest
 
-from sb3_dtfm.data.record_demonstrations import RecordingSummary, record_demonstrations
+from sb3_dtfm.cli.main import main
 from sb3_dtfm.data.robomimic import load_robomimic
 from sb3_dtfm.envs.demonstrators import DEMONSTRATORS, DOWNWARD, LiftDemonstrator, _rotation_between
 from sb3_dtfm.envs.robosuite import RobosuiteEnv
-from sb3_dtfm.zoo.cli import main
+from sb3_dtfm.recording.demonstrations import RecordingSummary, record_demonstrations
 
 
 @pytest.fixture(scope="module")

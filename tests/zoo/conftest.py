@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from stable_baselines3 import PPO
 
-from sb3_dtfm.zoo.cli import main
+from sb3_dtfm.cli.main import main
 
 DATASET_ID = "tests/halfcheetah/random-v0"
 TINY = {

@@ -12,7 +12,7 @@ import optuna
 import pytest
 
 from sb3_dtfm import DT, DTFM
-from sb3_dtfm.zoo.cli import main
+from sb3_dtfm.cli.main import main
 from tests.zoo.conftest import DATASET_ID, tiny_training
 
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "sb3_dtfm"]

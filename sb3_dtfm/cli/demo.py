@@ -14,8 +14,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_dtfm import DTFM
-from sb3_dtfm.data.record_demonstrations import record_demonstrations
-from sb3_dtfm.zoo import cli
+from sb3_dtfm.cli import main as cli
+from sb3_dtfm.recording.demonstrations import record_demonstrations
 from sb3_dtfm.zoo.plots import plot_learning_curve, wilson_interval
 
 ENV_ID = "robosuite/Lift-v0"

@@ -53,14 +53,14 @@ def enjoy(argv: Sequence[str]) -> None:
 
 def record(argv: Sequence[str]) -> None:
     """Make a dataset from a trained agent or a scripted demonstrator."""
-    from sb3_dtfm.zoo.recording import record as record_dataset
+    from sb3_dtfm.cli.record import record as record_dataset
 
     record_dataset(argv)
 
 
 def demo(argv: Sequence[str]) -> None:
     """Record, train and evaluate on robosuite's Lift, start to end."""
-    from sb3_dtfm.zoo.demo import main as run_demo
+    from sb3_dtfm.cli.demo import main as run_demo
 
     run_demo(argv)
 

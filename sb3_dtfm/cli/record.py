@@ -67,7 +67,7 @@ def record(argv: Sequence[str]) -> None:
 
 
 def _record_agent(options: argparse.Namespace) -> None:
-    from sb3_dtfm.data.record_agent import record_agent
+    from sb3_dtfm.recording.agent import record_agent
 
     optional = {} if options.n_envs is None else {"n_envs": options.n_envs}
     dataset = record_agent(
@@ -86,7 +86,7 @@ def _record_agent(options: argparse.Namespace) -> None:
 
 
 def _record_demonstrations(options: argparse.Namespace) -> None:
-    from sb3_dtfm.data.record_demonstrations import record_demonstrations
+    from sb3_dtfm.recording.demonstrations import record_demonstrations
 
     summary = record_demonstrations(
         options.demonstrator,

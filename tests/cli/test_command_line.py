@@ -5,7 +5,7 @@ import pytest
 import yaml
 
 from sb3_dtfm import DT, DTFM
-from sb3_dtfm.zoo.cli import main
+from sb3_dtfm.cli.main import main
 from tests.zoo.conftest import DATASET_ID, TINY, tiny_training
 
 ALGORITHMS = {"dt": DT, "dtfm": DTFM}

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from sb3_dtfm.zoo.cli import main
+from sb3_dtfm.cli.main import main
 
 ARGUMENTS = ["demo", "--output", "out", "--demonstrations", "2", "--steps", "2", "--episodes", "4"]
 

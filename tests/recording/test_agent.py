@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_dtfm.envs  # noqa: F401  (registers FetchReach)
 from sb3_dtfm.data import DatasetError, load_minari
-from sb3_dtfm.data.record_agent import record_agent
+from sb3_dtfm.recording.agent import record_agent
 
 AGENTS = Path(__file__).parents[2].parent / "shared" / "agents"
 SHORT = {"max_episode_steps": 15}

@@ -27,8 +27,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_dtfm.envs  # noqa: F401  (registers the tasks)
 from sb3_dtfm.data.minari import check_action_space
-from sb3_dtfm.data.rollout import ActFunction, RecordedEpisode, check_recording, run_episodes, show_progress
 from sb3_dtfm.data.trajectories import DatasetError
+from sb3_dtfm.recording.episodes import ActFunction, RecordedEpisode, check_recording, run_episodes, show_progress
 
 N_RANDOM_EPISODES = 10
 # Names RL-Zoo gives to algorithms that differ from their class names.

@@ -17,9 +17,9 @@ from gymnasium import spaces
 from tqdm import tqdm
 
 from sb3_dtfm.data.robomimic import DEFAULT_OBSERVATION_KEYS, RecordedEpisode, RobomimicWriter, refuse_existing
-from sb3_dtfm.data.rollout import check_recording
 from sb3_dtfm.envs.demonstrators import DEMONSTRATORS
 from sb3_dtfm.envs.robosuite import RobosuiteEnv
+from sb3_dtfm.recording.episodes import check_recording
 
 TASKS = {"lift": "Lift", "can": "Can"}
 ROBOT_COLUMNS = (3, 4, 2)  # widths of the observation keys before the object's

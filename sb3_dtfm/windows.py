@@ -1,5 +1,5 @@
 """
-The context window: the last K steps of every environment, as plain arrays.
+Windows of K consecutive steps: the one type of them, and the context that acting carries from step to step.
 
 Pure functions: each returns new arrays and leaves its arguments alone, so a context can serve as SB3's `state`.
 """
@@ -9,6 +9,22 @@ from typing import Any, NamedTuple
 import numpy as np
 
 OBSERVATION_KEYS = ("observation", "return_to_go", "timestep")
+
+
+class Windows(NamedTuple):
+    """
+    B windows of K consecutive steps, newest last, padded on the left; padded entries are zero and False in `mask`.
+
+    Tensors on their way through a network, arrays in a :class:`Context`. Shapes: observations (B, K, O), actions (B, K, A),
+    returns_to_go (B, K) in environment reward units, timesteps (B, K) int64 counted from the episode's start, mask (B, K)
+    bool. Whoever hands windows on says in which units observations and actions are.
+    """
+
+    observations: Any
+    actions: Any
+    returns_to_go: Any
+    timesteps: Any
+    mask: Any
 
 
 class Context(NamedTuple):
@@ -28,6 +44,11 @@ class Context(NamedTuple):
     mask: np.ndarray
     episode_keys: np.ndarray
     keys_values: np.ndarray
+
+    @property
+    def windows(self) -> Windows:
+        """The steps alone."""
+        return Windows(*(getattr(self, name) for name in Windows._fields))
 
 
 def empty_context(n_rows: int, context_length: int, observation_dim: int, action_dim: int) -> Context:

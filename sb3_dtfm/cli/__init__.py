@@ -1,0 +1,1 @@
+"""The `sb3-dtfm` command line: one file a command."""

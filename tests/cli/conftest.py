@@ -1,0 +1,3 @@
+from tests.zoo.conftest import minari_folder, workplace
+
+__all__ = ["minari_folder", "workplace"]
