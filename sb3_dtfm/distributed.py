@@ -12,6 +12,8 @@ import torch.distributed as dist
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
+from sb3_dtfm.windows import Windows
+
 LossFunction: TypeAlias = Callable[..., tuple[th.Tensor, dict[str, th.Tensor]]]
 
 # How long the others wait for what process 0 does alone between two gradient steps, evaluations above all.
@@ -43,12 +45,18 @@ def check_batch_size(batch_size: int) -> None:
 @contextlib.contextmanager
 def first_of_each_machine_first() -> Iterator[None]:
     """Let the first process of each machine download what the others then find on disk."""
+    if n_processes() == 1:
+        yield
+        return
+    # By gloo: a download may take longer than a barrier of the default group would wait.
+    group = dist.new_group(backend="gloo", timeout=PATIENCE)
     first = os.environ.get("LOCAL_RANK", "0") == "0"
-    if n_processes() > 1 and not first:
-        dist.barrier()
+    if not first:
+        dist.barrier(group)
     yield
-    if n_processes() > 1 and first:
-        dist.barrier()
+    if first:
+        dist.barrier(group)
+    dist.destroy_process_group(group)
 
 
 class _PolicyLoss(nn.Module):
@@ -89,23 +97,23 @@ class DataParallel:
             self.rank = dist.get_rank()
             share = batch_size // self.n_processes
             self._rows = slice(self.rank * share, (self.rank + 1) * share)
-            for tensor in policy.state_dict().values():
-                dist.broadcast(tensor, src=0)
+            for tensor in (*policy.parameters(), *policy.buffers()):
+                dist.broadcast(tensor.data, src=0)
             self._policy_loss = DistributedDataParallel(_PolicyLoss(policy.network, compute_loss), init_sync=False)
             # Messages between the processes themselves: by gloo, since a message over NCCL would wait for the GPU's queue.
             self._messages = dist.new_group(backend="gloo", timeout=PATIENCE)
 
-    def compute_loss(self, batch: Any, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+    def compute_loss(self, batch: Windows, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """
         This process's part of the policy's loss: the mean over all processes is the loss of the whole batch.
 
-        :param batch: the whole :class:`~sb3_dtfm.windows.Windows`, (B, K, ...)
+        :param batch: the whole batch, (B, K, ...)
         :param noise: what the policy draws for the whole batch, each (B, ...)
         :return: the loss to minimise, whose gradient will be the whole batch's, and its parts by their logged names
         """
         if self.n_processes == 1:
             return self._compute_loss(batch, *noise)
-        share = type(batch)(*(tensor[self._rows] for tensor in batch))
+        share = Windows(**{name: tensor[self._rows] for name, tensor in batch._asdict().items()})
         loss, parts = self._policy_loss(share, *(tensor[self._rows] for tensor in noise))
         weight = self._weight(batch.mask)
         loss, weighted = weight * loss, {name: weight * part for name, part in parts.items()}

@@ -4,6 +4,7 @@ Windows of K consecutive steps: the one type of them, and the context that actin
 Pure functions: each returns new arrays and leaves its arguments alone, so a context can serve as SB3's `state`.
 """
 
+import zlib
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,7 +34,7 @@ class Context(NamedTuple):
 
     Shapes: observations (B, K, O) as the environment gives them, actions (B, K, A) in [-1, 1], returns_to_go (B, K) in
     environment reward units, timesteps (B, K) int64, mask (B, K) bool, False on padded steps, episode_keys (B,) int64, a
-    hash of each episode's first observation, keys_values (B, ...), what the policy keeps of its earlier computation, (B, 0)
+    hash of the bytes of each episode's first observation, keys_values (B, ...), what the policy keeps of its earlier computation, (B, 0)
     if nothing.
     """
 
@@ -64,6 +65,18 @@ def empty_context(n_rows: int, context_length: int, observation_dim: int, action
     )
 
 
+def restarts(context: Context, timestep: np.ndarray, episode_start: np.ndarray | None = None) -> np.ndarray:
+    """
+    Where a new step begins a context of its own: at the start of an episode, and where it follows nothing.
+
+    :param timestep: (B,) int64
+    :param episode_start: (B,) bool, True where the caller says so
+    :return: (B,) bool
+    """
+    follows = context.mask[:, -1] & (timestep == context.timesteps[:, -1] + 1)
+    return ~follows if episode_start is None else ~follows | np.asarray(episode_start, dtype=bool)
+
+
 def push(
     context: Context,
     observation: np.ndarray,
@@ -72,29 +85,25 @@ def push(
     episode_start: np.ndarray | None = None,
 ) -> Context:
     """
-    Add a step to every row; its action stays zero until :func:`with_action`.
-
-    A row starts anew where `episode_start` is True, and also where the step does not follow the row's last one: the
-    environment was reset without anybody saying so.
+    Add a step to every row; its action stays zero until :func:`with_action`. Rows start anew where :func:`restarts` says so.
 
     :param observation: (B, O)
     :param return_to_go: (B,)
     :param timestep: (B,) int64
     :param episode_start: (B,) bool
     """
-    restart = timestep != context.timesteps[:, -1] + 1
-    if episode_start is not None:
-        restart |= np.asarray(episode_start, dtype=bool)
-    first_bits = np.ascontiguousarray(observation, np.float32).view(np.int32).sum(axis=1, dtype=np.int64)
+    restart = restarts(context, timestep, episode_start)
     keep = ~restart[:, None]
-    no_action = np.zeros_like(context.actions[:, 0])
+    episode_keys = context.episode_keys.copy()
+    for row in np.flatnonzero(restart):
+        episode_keys[row] = zlib.crc32(np.ascontiguousarray(observation[row], np.float32))
     return Context(
         _shift(context.observations, observation),
-        _shift(context.actions, no_action),
+        _shift(context.actions, np.zeros_like(context.actions[:, 0])),
         _shift(context.returns_to_go, return_to_go),
         _shift(context.timesteps, timestep),
         np.concatenate((context.mask[:, 1:] & keep, np.ones_like(keep)), axis=1),
-        np.where(restart, first_bits, context.episode_keys),
+        episode_keys,
         context.keys_values,
     )
 

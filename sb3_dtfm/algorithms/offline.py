@@ -12,14 +12,16 @@ import minari
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from gymnasium.envs.registration import parse_env_id
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import configure_logger, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_dtfm.arguments import COUNT, NOT_NEGATIVE, POSITIVE, PROBABILITY_BELOW_1, Choice, Number, check_arguments
 from sb3_dtfm.callbacks import GradientStepProgressBar, NormalizedScoreCallback, find_eval_callbacks
-from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer, load_dataset
+from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer, check_action_space, load_dataset
 from sb3_dtfm.distributed import (
     DataParallel,
     LossFunction,
@@ -30,9 +32,24 @@ from sb3_dtfm.distributed import (
 from sb3_dtfm.envs import check_vec_env, return_to_go_space
 from sb3_dtfm.optimization import LEARNING_RATE_SCHEDULES, PRECISIONS, RunningMeans, autocast, learning_rate_factor
 from sb3_dtfm.policies import SequencePolicy
+from sb3_dtfm.windows import Windows
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineSequenceAlgorithm")
 Dataset: TypeAlias = str | PathLike[str] | minari.MinariDataset | TrajectoryBuffer
+
+ACCEPTED = {
+    "batch_size": COUNT,
+    "weight_decay": NOT_NEGATIVE,
+    "context_length": COUNT,
+    "dataset_fraction": Number(low=0, high=1, above_low=True),
+    "dataset_seed": Number(low=0, whole=True),
+    "timestep_exponent": POSITIVE,
+    "max_grad_norm": NOT_NEGATIVE._replace(optional=True),
+    "warmup_steps": Number(low=0, whole=True),
+    "learning_rate_schedule": Choice(LEARNING_RATE_SCHEDULES),
+    "ema_decay": PROBABILITY_BELOW_1,
+    "precision": Choice(PRECISIONS),
+}
 
 
 class OfflineSequenceAlgorithm(BaseAlgorithm):
@@ -54,9 +71,10 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
     :param timestep_exponent: e of the time step T u^e at which windows end in an episode of T steps, for u uniform in
         [0, 1]: above 1 an episode's start, of which there is little in long episodes, is learned from more often
     :param dataset_kwargs: further arguments of :func:`~sb3_dtfm.data.load_dataset`: `{"cache_dir": folder}` for datasets
-        larger than memory, and the reader's own, for example `{"filter_key": "train"}` for robomimic
-    :param max_grad_norm: clip the gradient's norm to this; None does not clip
-    :param warmup_steps: gradient steps over which the learning rate rises linearly from zero
+        larger than memory, `{"env_id": id}` for data that were recorded under another environment's name, and the
+        reader's own, for example `{"filter_key": "train"}` for robomimic
+    :param max_grad_norm: clip the gradient's norm to this; None and 0 do not clip
+    :param warmup_steps: gradient steps over which the learning rate rises linearly from zero; 0 for none
     :param learning_rate_schedule: factor on the learning rate: "constant", or "linear" or "cosine" down to zero
     :param ema_decay: decay of the exponential moving average of weights that acts; 0 acts with the trained weights
     :param precision: "float32", "bfloat16" (autocast), or "auto": bfloat16 where the hardware multiplies in it
@@ -140,22 +158,15 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
             self.max_timestep = int(buffer.episode_lengths.max())
             self.score_reference = buffer.score_reference
             self._setup_model()
-            self.policy.set_statistics(*buffer.statistics())
-            if self.policy.clip_return_to_go:
-                self.policy.set_return_to_go_range(buffer.return_to_go_range())
+            normalization = self.policy.normalization
+            normalization.set_statistics(*buffer.statistics())
+            if normalization.return_to_go_range is not None:
+                normalization.set_return_to_go_range(buffer.return_to_go_range())
 
     def _check_arguments(self) -> None:
-        choices = {"learning_rate_schedule": LEARNING_RATE_SCHEDULES, "precision": PRECISIONS}
-        for name, accepted in choices.items():
-            if getattr(self, name) not in accepted:
-                raise ValueError(f"{name} must be one of {', '.join(accepted)}, got {getattr(self, name)!r}.")
-        for name in ("batch_size", "context_length"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
-        if not 0.0 < self.timestep_exponent < math.inf:
-            raise ValueError(f"timestep_exponent must be positive and finite, got {self.timestep_exponent}.")
-        if not 0.0 <= self.ema_decay < 1.0:
-            raise ValueError(f"ema_decay must lie in [0, 1), got {self.ema_decay}.")
+        check_arguments(vars(self), ACCEPTED)
+        if not callable(self.learning_rate):
+            check_arguments({"learning_rate": self.learning_rate}, {"learning_rate": POSITIVE})
         check_batch_size(self.batch_size)
 
     def set_dataset(self, dataset: Dataset) -> None:
@@ -181,47 +192,120 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         observation_space = return_to_go_space(buffer.observation_space)
         if getattr(self, "observation_space", None) is None:
             self.observation_space, self.action_space, self.n_envs = observation_space, buffer.action_space, 1
-        expected, found = self.observation_space["observation"], buffer.observation_space  # type: ignore[index]
-        if expected.shape != found.shape:
-            raise DatasetError(f"{buffer.source} holds observations of {found}, the environment gives {expected}.")
-        same_bounds = self.action_space.shape == buffer.action_space.shape and (
-            np.allclose(self.action_space.low, buffer.action_space.low)
-            and np.allclose(self.action_space.high, buffer.action_space.high)
-        )
-        if not same_bounds:
-            raise DatasetError(
-                f"{buffer.source} holds actions of {buffer.action_space}, the environment takes {self.action_space}."
-            )
+        self._check_spaces(observation_space, buffer.action_space, f"{buffer.source} holds", "the environment's are")
+        self._check_task(buffer)
         self.buffer = buffer.random_fraction(self.dataset_fraction, self.dataset_seed).to(self.device)
         return self.buffer
 
+    def _check_spaces(self, observation_space: spaces.Space, action_space: spaces.Space, found: str, expected: str) -> None:
+        """
+        Compare with the model's spaces what the policy depends on: sizes, and the range of actions.
+
+        :raises DatasetError: they do not fit
+        """
+        ours, theirs = self.observation_space["observation"], observation_space["observation"]  # type: ignore[index]
+        if ours.shape != theirs.shape:
+            raise DatasetError(f"{found} observations of {theirs}, {expected} {ours}.")
+        same_bounds = self.action_space.shape == action_space.shape and (
+            np.allclose(self.action_space.low, action_space.low) and np.allclose(self.action_space.high, action_space.high)
+        )
+        if not same_bounds:
+            raise DatasetError(f"{found} actions of {action_space}, {expected} {self.action_space}.")
+
+    def _check_task(self, buffer: TrajectoryBuffer) -> None:
+        """
+        :raises DatasetError: the data were recorded in another environment than the model's; versions may differ
+        """
+        spec = None if self.env is None else self.env.get_attr("spec", indices=0)[0]
+        if spec is None or buffer.env_id is None or parse_env_id(spec.id)[:2] == parse_env_id(buffer.env_id)[:2]:
+            return
+        raise DatasetError(
+            f"{buffer.source} was recorded in {buffer.env_id}, and the environment is {spec.id}. If the data are meant for "
+            f"it, say so with dataset_kwargs={{'env_id': {spec.id!r}}}."
+        )
+
     def _setup_model(self) -> None:
+        self._check_arguments()
+        if self.score_reference is not None:  # a list in a saved file
+            self.score_reference = ScoreReference(*self.score_reference)
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         self.policy = self.policy_class(  # type: ignore[assignment]
-            self.observation_space, self.action_space, self.lr_schedule, **self._policy_arguments()
-        ).to(self.device)
-
-    def _policy_arguments(self) -> dict[str, Any]:
-        return dict(
+            self.observation_space,
+            self.action_space,
+            self.lr_schedule,
             context_length=self.context_length,
             max_timestep=self.max_timestep,
             weight_decay=self.weight_decay,
             ema=self.ema_decay > 0,
             seed=self.seed,
             **self.policy_kwargs,
-        )
+        ).to(self.device)
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """
+        Seed everything random, the noise of `predict(deterministic=False)` included.
+
+        :param seed: None changes nothing
+        """
+        super().set_random_seed(seed)
+        if seed is not None and hasattr(self, "policy"):
+            self.policy.seed_noise(seed)
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         """
-        SB3's wrapping, then a check that return-to-go arrives unharmed.
+        SB3's wrapping, then a check that return-to-go arrives unharmed and that actions can be learned.
 
-        :raises ValueError: no return-to-go in the observation, or normalised or stacked observations
+        :raises ValueError: no return-to-go in the observation, normalised or stacked observations, or unbounded actions
         """
         vec_env = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         check_vec_env(vec_env)
+        check_action_space(vec_env.action_space, "the environment")
         return vec_env
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        Act in another environment from now on.
+
+        :param env: of the model's sizes and range of actions; the bounds of observations may differ, since the policy
+            normalises them itself
+        :param force_reset: as in SB3
+        :raises ValueError: it does not fit
+        """
+        vec_env = self._wrap_env(env, self.verbose)
+        self._check_spaces(vec_env.observation_space, vec_env.action_space, "The environment has", "the model's are")
+        self.observation_space, self.n_envs = vec_env.observation_space, vec_env.num_envs
+        self.action_space = vec_env.action_space  # type: ignore[assignment]
+        super().set_env(vec_env, force_reset)
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfAlgorithm],
+        path: str | Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfAlgorithm:
+        """
+        SB3's loading; arguments are SB3's.
+
+        :param path: file to load
+        :param env: see :meth:`set_env`
+        :param device: "auto", "cpu" or "cuda"
+        :param custom_objects: objects to use in place of those in the file
+        :param print_system_info: print what the file was saved with
+        :param force_reset: as in SB3
+        :param kwargs: attributes to change, `dataset` for example
+        :raises ValueError: an attribute out of range, or an environment that does not fit
+        """
+        model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
+        if env is not None:
+            model.set_env(env, force_reset)
+        return model
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         if not is_first_process():
@@ -285,20 +369,20 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         :param progress_bar: show one
         :return: the model
         :raises ValueError: no dataset
-        :raises FloatingPointError: the loss is no longer finite
+        :raises FloatingPointError: the loss or its gradient is no longer finite; the weights are those from before
         """
         buffer = self.buffer or self._load_buffer()
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         parallel = DataParallel(self.policy, self._loss_function(), self.batch_size)
-        generator = self._training_generator(parallel)
+        batch_generator, noise_generator = self._training_generators(parallel)
+        batches = buffer.batches(self.batch_size, self.context_length, batch_generator, self.timestep_exponent)
         callback.on_training_start(locals(), globals())
-        ends = buffer.draw(self.batch_size, generator, self.timestep_exponent)
         while self.num_timesteps < total_timesteps:
             step_start = time.perf_counter()
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
-            ends = self._gradient_step(buffer, ends, generator, parallel)
+            self._gradient_step(next(batches), noise_generator, parallel)
             self.num_timesteps += 1
             self._training_seconds += time.perf_counter() - step_start
             if log_interval and (self.num_timesteps % log_interval == 0 or self.num_timesteps == total_timesteps):
@@ -306,6 +390,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
             callback.update_locals(locals())
             if not parallel.from_first(callback.on_step()):
                 break
+        self._check_finite(self._pop_means())
         callback.on_training_end()
         parallel.close()
         return self
@@ -316,30 +401,26 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         compute_loss = th.compile(self.policy.compute_loss) if compile_it else self.policy.compute_loss
         return autocast(self.precision, self.device)(compute_loss)
 
-    def _gradient_step(
-        self, buffer: TrajectoryBuffer, ends: th.Tensor, generator: th.Generator, parallel: DataParallel
-    ) -> th.Tensor:
-        """
-        Learn from the windows that end at `ends`.
-
-        :return: the ends of the next batch, whose windows are read from disk meanwhile where the buffer is a cache
-        """
+    def _gradient_step(self, batch: Windows, generator: th.Generator, parallel: DataParallel) -> None:
+        """Learn from a batch; a loss or gradient that is not finite changes nothing."""
         self.policy.set_training_mode(True)  # an evaluation in between leaves evaluation mode on
-        self._update_learning_rate(self.policy.optimizer)
-        self.policy.optimizer.zero_grad(set_to_none=True)  # before the loss, which has the most in memory
-        batch = buffer.windows(ends, self.context_length)
+        optimizer: Any = self.policy.optimizer
+        self._update_learning_rate(optimizer)
+        optimizer.zero_grad(set_to_none=True)  # before the loss, which has the most in memory
         loss, parts = parallel.compute_loss(batch, *self.policy.draw_noise(batch, generator))
-        next_ends = buffer.draw(self.batch_size, generator, self.timestep_exponent)
-        buffer.prefetch(next_ends, self.context_length)
         loss.backward()
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.clipped_parameters(), self.max_grad_norm or math.inf)
-        self.policy.optimizer.step()
+        means = parallel.mean({"loss": loss, "grad_norm": grad_norm, **parts})
+        self._means.add(means)
+        # The fused optimiser leaves the weights alone where this is 1, and no host has to wait for a GPU to tell.
+        optimizer.found_inf = (~th.isfinite(means["loss"] + means["grad_norm"])).float().detach()
+        optimizer.step()
         self._n_updates += 1
+        if self.device.type == "cpu":
+            self._check_finite({name: float(means[name].detach()) for name in ("loss", "grad_norm")})
         if self.ema_decay > 0:
             # A young average follows more closely, or the random start would stay in it for long.
             self.policy.update_ema(min(self.ema_decay, (1 + self._n_updates) / (10 + self._n_updates)))
-        self._means.add(parallel.mean({"loss": loss, "grad_norm": grad_norm, **parts}))
-        return next_ends
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         remaining = self._current_progress_remaining
@@ -348,33 +429,45 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         for optimizer in optimizers if isinstance(optimizers, list) else [optimizers]:
             update_learning_rate(optimizer, self._current_learning_rate)
 
-    def _training_generator(self, parallel: DataParallel) -> th.Generator:
-        """Randomness of batches and losses: the run's own, and another stream where training is continued."""
-        generator = th.Generator(self.device)
-        if self.seed is None:
-            seed = generator.seed()
-        else:
-            seed = int(np.random.SeedSequence([self.seed, self.num_timesteps]).generate_state(1, np.uint64)[0])
-        return generator.manual_seed(parallel.seed(seed))
+    def _training_generators(self, parallel: DataParallel) -> tuple[th.Generator, th.Generator]:
+        """Randomness of batches and of losses: the run's own, and other streams where training is continued."""
+        seed = parallel.seed(th.Generator().seed() if self.seed is None else self.seed)
+        states = np.random.SeedSequence([seed, self._n_updates]).generate_state(2, np.uint64)
+        batches, noise = (th.Generator(self.device).manual_seed(int(state)) for state in states)
+        return batches, noise
 
     def dump_logs(self) -> None:
         """
         Log the means since the last call.
 
-        :raises FloatingPointError: the loss is no longer finite
+        :raises FloatingPointError: the loss or its gradient is no longer finite
         """
         n_steps = self._means.n_values
         if n_steps == 0:
             return
-        means = self._means.pop()
-        if not math.isfinite(means["loss"]):
-            raise FloatingPointError(
-                f"The loss became {means['loss']} within the {n_steps} gradient steps before step {self.num_timesteps}. "
-                "Try a lower learning_rate, warmup_steps or max_grad_norm."
-            )
+        means = self._pop_means()
+        self._check_finite(means)
         if is_first_process():
             self._log(means, n_steps)
         self._training_seconds = 0.0
+
+    def _pop_means(self) -> dict[str, float]:
+        """The means since the last call; where a GPU computes them, the time to wait for them is training time."""
+        start = time.perf_counter()
+        means = self._means.pop()
+        self._training_seconds += time.perf_counter() - start
+        return means
+
+    def _check_finite(self, means: dict[str, float]) -> None:
+        """
+        :raises FloatingPointError: the loss or its gradient is no longer finite
+        """
+        for name in ("loss", "grad_norm"):
+            if not math.isfinite(means.get(name, 0.0)):
+                raise FloatingPointError(
+                    f"The {name} became {means[name]} at or before gradient step {self._n_updates} of this model, whose "
+                    "weights are still those from before it. Try a lower learning_rate, warmup_steps or max_grad_norm."
+                )
 
     def _log(self, means: dict[str, float], n_steps: int) -> None:
         for name, mean in means.items():

@@ -4,10 +4,11 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_dtfm.networks.dropout import dropout, dropout_add
-from sb3_dtfm.networks.linear import Linear
+from sb3_dtfm.networks.cpu import Linear, dropout, dropout_add
 
 ALL = slice(None)
+# Tokens that a step adds while acting: the last action, the return-to-go and the observation.
+TOKENS_PER_STEP = 3
 
 
 class TransformerBlock(nn.Module):
@@ -121,10 +122,6 @@ class SequenceTrunk(nn.Module):
         super().__init__()
         if embed_dim % n_heads:
             raise ValueError(f"embed_dim must be a multiple of n_heads, got embed_dim={embed_dim} and n_heads={n_heads}.")
-        if n_layers < 1:
-            raise ValueError(f"n_layers must be at least 1, got {n_layers}.")
-        if not 0.0 <= dropout < 1.0:
-            raise ValueError(f"dropout must lie in [0, 1), got {dropout}.")
         self.embed_dim = embed_dim
         self.n_layers = n_layers
         self.n_heads = n_heads

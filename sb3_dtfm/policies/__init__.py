@@ -1,7 +1,33 @@
 """The policies: `DTPolicy` and `DTFMPolicy` differ in their head only."""
 
-from sb3_dtfm.policies.dt import DTPolicy
-from sb3_dtfm.policies.dtfm import DTFMPolicy
+from sb3_dtfm.heads import FlowHead, RegressionHead
 from sb3_dtfm.policies.sequence import SequencePolicy
+
+
+class DTPolicy(SequencePolicy):
+    """Decision Transformer: the action is regressed from the hidden state. Arguments are those of `SequencePolicy`."""
+
+    head_class = RegressionHead
+
+
+class DTFMPolicy(SequencePolicy):
+    """
+    Decision Transformer with flow matching: the hidden state conditions a vector field from noise to action.
+
+    Arguments are those of `SequencePolicy` and, by name, the options of :class:`~sb3_dtfm.heads.flow.FlowHead`.
+    """
+
+    head_class = FlowHead
+
+    def set_solver(self, solver: str, n_solver_steps: int = 1) -> None:
+        """
+        Choose how to act; the trained weights do not depend on it.
+
+        :param solver: euler, midpoint, heun or rk4, or one_step: a single evaluation of the network that learnt their end
+        :param n_solver_steps: steps of the ODE solver
+        :raises ValueError: unknown solver, fewer than one step, or one_step of a model that did not learn it
+        """
+        self.set_acting(solver=solver, n_solver_steps=n_solver_steps)
+
 
 __all__ = ["DTFMPolicy", "DTPolicy", "SequencePolicy"]

@@ -1,9 +1,9 @@
-"""What every policy shares: normalisation, context, acting, optimiser."""
+"""The policy: a trunk, a head, and acting with the context of the last steps."""
 
 import copy
+import inspect
 import json
-from abc import abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -12,29 +12,45 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_dtfm.networks.heads import RegressionHead
-from sb3_dtfm.networks.linear import threads_for
-from sb3_dtfm.networks.trunk import SequenceTrunk
-from sb3_dtfm.policies.kv_cache import TOKENS_PER_STEP, KeysValuesCache
-from sb3_dtfm.windows import Context, Windows, empty_context, push, unpack_observation, with_action
+from sb3_dtfm.arguments import COUNT, NOT_NEGATIVE, PROBABILITY_BELOW_1, check_arguments
+from sb3_dtfm.heads import ActionHead
+from sb3_dtfm.networks.trunk import TOKENS_PER_STEP, SequenceTrunk
+from sb3_dtfm.policies.memory import RememberedContext
+from sb3_dtfm.policies.normalization import Normalization
+from sb3_dtfm.windows import Context, Windows, empty_context, push, restarts, unpack_observation, with_action
 
-# Observations are clipped at this many standard deviations, as SB3's VecNormalize does.
-OBSERVATION_CLIP = 10.0
+# Rows of the table that deterministic acting takes its noise from.
+NOISE_ROWS = 1024
+ACCEPTED = {
+    "context_length": COUNT,
+    "max_timestep": COUNT,
+    "embed_dim": COUNT,
+    "n_layers": COUNT,
+    "n_heads": COUNT,
+    "dropout": PROBABILITY_BELOW_1,
+    "weight_decay": NOT_NEGATIVE,
+}
+# What the algorithm gives to the policy by itself; everything else is for `policy_kwargs`.
+FROM_ALGORITHM = ("context_length", "max_timestep", "weight_decay", "ema", "seed")
 
 
 class SequenceNetwork(nn.Module):
-    """Everything that is trained: the trunk, the action head and, if asked for, the auxiliary regression head."""
+    """Everything that is trained."""
 
-    def __init__(self, trunk: SequenceTrunk, head: nn.Module, auxiliary_head: RegressionHead | None = None) -> None:
+    def __init__(self, trunk: SequenceTrunk, head: ActionHead) -> None:
         super().__init__()
         self.trunk = trunk
         self.head = head
-        self.auxiliary_head = auxiliary_head
 
 
 class SequencePolicy(BasePolicy):
     """
-    A policy over the last `context_length` steps.
+    A policy over the last `context_length` steps: the trunk's hidden state, and a head that makes an action of it.
+
+    `deterministic=True` starts from noise that belongs to the time step and the episode: rows of a table that is drawn once
+    from `seed` and saved with the model, from a row on that the episode's first observation decides. Zero noise would be one
+    point of the distribution, and following the same mode for ever gets an arm stuck; the same rows in every episode would
+    give all of them the same luck.
 
     :param observation_space: Dict of `observation` (O,), `return_to_go` (1,) and `timestep` (1,)
     :param action_space: bounded Box (A,)
@@ -51,18 +67,16 @@ class SequencePolicy(BasePolicy):
         any episode reached, or falling behind, then stays an input like those the policy learned from
     :param ema: keep an exponential moving average of the weights and act with it
     :param kv_cache: act on the keys and values kept of earlier steps instead of recomputing the window: two to three times
-        faster, and equal until the window slides (see :meth:`SequenceTrunk.extend`); can be set at any time
+        faster, and equal until the window slides (see :meth:`SequenceTrunk.extend`)
     :param seed: seed of the noise that acting starts from
+    :param head_options: options of the head, see its class
+    :raises ValueError: an argument out of range or unknown, by name
     """
 
+    head_class: ClassVar[type[ActionHead]]
     observation_space: spaces.Dict
     action_space: spaces.Box
-    observation_mean: th.Tensor
-    observation_std: th.Tensor
-    return_scale: th.Tensor
-    return_to_go_range: th.Tensor | None
-    action_low: th.Tensor
-    action_high: th.Tensor
+    noise_table: th.Tensor
 
     def __init__(
         self,
@@ -81,87 +95,46 @@ class SequencePolicy(BasePolicy):
         ema: bool = False,
         kv_cache: bool = False,
         seed: int | None = None,
+        **head_options: Any,
     ) -> None:
         super().__init__(observation_space, action_space, normalize_images=False, optimizer_class=th.optim.AdamW)
+        arguments = {name: value for name, value in locals().items() if name in _own_parameters()}
+        check_arguments(arguments, ACCEPTED)
+        self._check_names(head_options)
+        self._constructor_arguments = {**arguments, **self.head_class.options(), **head_options}
         self.context_length = context_length
-        self.max_timestep = max_timestep
-        self.embed_dim = embed_dim
-        self.n_layers = n_layers
-        self.n_heads = n_heads
-        self.dropout = dropout
-        self.timestep_embedding = timestep_embedding
         self.weight_decay = weight_decay
-        self.clip_return_to_go = clip_return_to_go
-        self.ema = ema
         self.kv_cache = kv_cache
         self.seed = seed
         self.observation_dim = int(observation_space["observation"].shape[0])  # type: ignore[index]
         self.action_dim = int(action_space.shape[0])
-        self.register_buffer("observation_mean", th.zeros(self.observation_dim))
-        self.register_buffer("observation_std", th.ones(self.observation_dim))
-        self.register_buffer("return_scale", th.ones(()))
-        unlimited = th.tensor([[-th.inf], [th.inf]]).repeat(1, max_timestep) if clip_return_to_go else None
-        self.register_buffer("return_to_go_range", unlimited)
-        self.register_buffer("action_low", th.as_tensor(action_space.low), persistent=False)
-        self.register_buffer("action_high", th.as_tensor(action_space.high), persistent=False)
-        self._context: Context | None = None
-        self._keys_values = KeysValuesCache()
-
+        self.normalization = Normalization(self.observation_dim, action_space, max_timestep, clip_return_to_go)
         dims = (self.observation_dim, self.action_dim)
         trunk = SequenceTrunk(*dims, max_timestep, embed_dim, n_layers, n_heads, dropout, timestep_embedding)
-        self.network = SequenceNetwork(trunk, self._make_head(), self._make_auxiliary_head())
+        self.network = SequenceNetwork(trunk, self.head_class(embed_dim, self.action_dim, **head_options))
         self.ema_network = copy.deepcopy(self.network).requires_grad_(False) if ema else None
         self.optimizer = self._make_optimizer(lr_schedule(1.0))
+        generator = th.Generator().manual_seed(0 if seed is None else seed)
+        self.register_buffer("noise_table", standard_normal(NOISE_ROWS, self.network.head.noise_dim, generator))
+        self._acting_generator: th.Generator | None = None
+        self._remembered = RememberedContext()
+
+    @classmethod
+    def parameter_names(cls) -> set[str]:
+        """What `policy_kwargs` may hold: the trunk's and the head's options."""
+        return (_own_parameters() - set(FROM_ALGORITHM)) | set(cls.head_class.options())
+
+    @classmethod
+    def _check_names(cls, head_options: dict[str, Any]) -> None:
+        unknown = sorted(set(head_options) - set(cls.head_class.options()))
+        if unknown:
+            accepted = ", ".join(sorted(cls.parameter_names()))
+            raise ValueError(f"policy_kwargs: {', '.join(unknown)} is unknown to {cls.__name__}; accepted are {accepted}.")
 
     @property
     def acting_network(self) -> SequenceNetwork:
         """The weights that choose actions: the moving average if there is one."""
         return self.network if self.ema_network is None else self.ema_network
-
-    @abstractmethod
-    def _make_head(self) -> nn.Module:
-        """The action head."""
-
-    def _make_auxiliary_head(self) -> RegressionHead | None:
-        """A regression head beside the action head, if the policy has one."""
-        return None
-
-    def draw_noise(self, batch: Any, generator: th.Generator) -> tuple[th.Tensor, ...]:
-        """
-        What the loss draws at random, one row per window: drawn apart from it, so that the loss is a plain function.
-
-        :param batch: a :class:`~sb3_dtfm.windows.Windows`
-        :param generator: on the policy's device
-        :return: further arguments of :meth:`compute_loss`, each (B, ...)
-        """
-        return ()
-
-    def part_masks(self, mask: th.Tensor) -> dict[str, th.Tensor]:
-        """
-        Parts of the loss that are means over some of the valid steps only; each is a plain summand of the loss.
-
-        :param mask: (B, K) bool, of a batch
-        :return: the steps of such a part (B, ...) bool, by its logged name
-        """
-        return {}
-
-    @abstractmethod
-    def compute_loss(self, batch: Any, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        """
-        :param batch: a :class:`~sb3_dtfm.windows.Windows`, actions in the environment's range
-        :param noise: what :meth:`draw_noise` gave for the batch
-        :return: the loss to minimise, and its parts by their logged names
-        """
-
-    @abstractmethod
-    def _generate(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
-        """
-        Actions from hidden states.
-
-        :param hidden: (B, D)
-        :param noise: (B, A), standard normal
-        :return: (B, A), to be clipped to [-1, 1]
-        """
 
     def _make_optimizer(self, learning_rate: float) -> th.optim.Optimizer:
         """AdamW whose weight decay spares biases, norms and embeddings."""
@@ -173,71 +146,53 @@ class SequencePolicy(BasePolicy):
 
     def clipped_parameters(self) -> list[nn.Parameter]:
         """The parameters whose gradient norm is logged and clipped."""
-        return list(self.network.parameters())
+        spared = {id(parameter) for parameter in self.network.head.unclipped_parameters()}
+        return [parameter for parameter in self.network.parameters() if id(parameter) not in spared]
 
-    def set_statistics(self, observation_mean: np.ndarray, observation_std: np.ndarray, return_scale: float) -> None:
-        """
-        Take the input normalisation from training data.
-
-        :param observation_mean: (O,)
-        :param observation_std: (O,)
-        :param return_scale: largest absolute return-to-go, environment reward units
-        """
-        self.observation_mean.copy_(th.from_numpy(observation_mean))
-        # A constant dimension becomes zero.
-        self.observation_std.copy_(th.from_numpy(np.where(observation_std > 1e-6, observation_std, 1.0)))
-        self.return_scale.fill_(return_scale if return_scale > 0 else 1.0)
-
-    def set_return_to_go_range(self, limits: th.Tensor) -> None:
-        """
-        :param limits: (2, max_timestep), smallest and largest return-to-go by time step, environment reward units
-        """
-        assert self.return_to_go_range is not None
-        self.return_to_go_range.copy_(limits)
-
-    def scale_action(self, action: Any) -> Any:
-        """From the environment's range to [-1, 1]; accepts tensors (..., A) and, as SB3 does, arrays."""
-        if isinstance(action, np.ndarray):
-            return super().scale_action(action)
-        return 2.0 * (action - self.action_low) / (self.action_high - self.action_low) - 1.0
+    def scaled_windows(self, batch: Windows) -> Windows:
+        """The windows of a buffer, with actions in [-1, 1]."""
+        return batch._replace(actions=self.normalization.scale_action(batch.actions))
 
     def hidden_states(self, network: SequenceNetwork, windows: Windows, last_only: bool = False) -> th.Tensor:
         """
-        Run the trunk on windows in environment units.
+        Run the trunk on windows in environment units, actions in [-1, 1].
 
         :return: (B, K, D), or (B, 1, D) of the newest steps with `last_only`
         """
-        return network.trunk(*self._normalized(windows), last_only)
+        return network.trunk(**self.normalization(windows)._asdict(), last_only=last_only)
 
-    def _normalized(self, windows: Windows) -> Windows:
-        observations = (windows.observations - self.observation_mean) / self.observation_std
-        returns_to_go = windows.returns_to_go
-        if self.return_to_go_range is not None:
-            low, high = self.return_to_go_range[:, windows.timesteps.clamp(max=self.max_timestep - 1)]
-            returns_to_go = returns_to_go.clamp(low, high)
-        return windows._replace(
-            observations=observations.clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP),
-            returns_to_go=returns_to_go / self.return_scale,
-        )
+    def draw_noise(self, batch: Windows, generator: th.Generator) -> tuple[th.Tensor, ...]:
+        """What the head's loss draws at random for a batch, see :meth:`ActionHead.draw_noise`."""
+        return self.network.head.draw_noise(batch.actions, generator)
 
-    def scaled_windows(self, batch: Any) -> Windows:
-        """The windows of a :class:`~sb3_dtfm.windows.Windows`, with actions in [-1, 1]."""
-        return batch._replace(actions=self.scale_action(batch.actions))
+    def part_masks(self, mask: th.Tensor) -> dict[str, th.Tensor]:
+        """See :meth:`ActionHead.part_masks`."""
+        return self.network.head.part_masks(mask)
 
-    def action_mse(self, batch: Any, generator: th.Generator) -> th.Tensor:
+    def compute_loss(self, batch: Windows, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        """
+        :param batch: windows of a buffer, actions in the environment's range
+        :param noise: what :meth:`draw_noise` gave for the batch
+        :return: the loss to minimise, and its parts by their logged names
+        """
+        windows = self.scaled_windows(batch)
+        return self.network.head.loss(self.hidden_states(self.network, windows), windows.actions, windows.mask, *noise)
+
+    def action_mse(self, batch: Windows, generator: th.Generator) -> th.Tensor:
         """
         Mean squared error, in units of [-1, 1], of the acting policy's actions at each window's last step.
 
         The same measure for every head: what `predict` would do on recorded windows against what was recorded.
 
-        :param batch: a :class:`~sb3_dtfm.windows.Windows`
+        :param batch: windows of a buffer
         :param generator: source of the noise that actions start from
         """
         self.set_training_mode(False)
         with th.no_grad():
             windows = self.scaled_windows(batch)
-            hidden = self.hidden_states(self.acting_network, windows, last_only=True).squeeze(1)
-            actions = self._generate(hidden, standard_normal(len(hidden), self.action_dim, generator)).clamp(-1.0, 1.0)
+            network = self.acting_network
+            hidden = self.hidden_states(network, windows, last_only=True).squeeze(1)
+            actions = network.head(hidden, standard_normal(len(hidden), network.head.noise_dim, generator)).clamp(-1.0, 1.0)
             return (actions - windows.actions[:, -1]).square().mean()
 
     def update_ema(self, decay: float) -> None:
@@ -260,9 +215,10 @@ class SequencePolicy(BasePolicy):
         """
         Choose actions with the whole context.
 
-        With `state` given this is a pure function. Without it the policy keeps the context itself, so that
-        `action, _ = model.predict(obs)` in a loop is enough: a row starts anew whenever its time step is not the last
-        one plus one.
+        With `state` or `episode_start` given this is a pure function: a context belongs to whoever passes it on. With
+        neither, the policy remembers the context of one caller, so that `action, _ = model.predict(obs)` in a loop is
+        enough: a row starts anew where its time step is not the last one plus one, and is asked again where both time step
+        and observation are the last ones. :meth:`reset` forgets it.
 
         :param observation: Dict of `observation` (O,), `return_to_go` (1,), `timestep` (1,), or with a leading axis B
         :param state: what the last call returned
@@ -272,41 +228,52 @@ class SequencePolicy(BasePolicy):
         :raises ValueError: not the observation of a `ReturnToGoWrapper`, or a state of another number of environments
         """
         arrays, vectorized = unpack_observation(observation, self.observation_dim)
-        n_rows = len(arrays[0])
-        if state is not None:
-            context = Context(*state)
-            if len(context.mask) != n_rows:
-                raise ValueError(f"state belongs to {len(context.mask)} environments, the observation to {n_rows}.")
-        elif self._context is not None and len(self._context.mask) == n_rows:
-            context = self._context
-        else:
-            context = empty_context(n_rows, self.context_length, self.observation_dim, self.action_dim)
-        context = push(context, *arrays, episode_start=episode_start)
+        n_rows, timestep = len(arrays[0]), arrays[2]
+        remembers = state is None and episode_start is None
+        before = Context(*state) if state is not None else None
+        if remembers:
+            before = self._remembered.recall(arrays[0], timestep)
+        if before is None:
+            before = empty_context(n_rows, self.context_length, self.observation_dim, self.action_dim)
+        if len(before.mask) != n_rows:
+            raise ValueError(f"state belongs to {len(before.mask)} environments, the observation to {n_rows}.")
+        lost = restarts(before, timestep) & (timestep > 0)
+        if episode_start is not None:
+            lost &= ~np.asarray(episode_start, dtype=bool)
+        if lost.any():
+            self._remembered.warn(f"Time step {timestep[lost][0]} follows none that is known: its past is missing.")
+        context = push(before, *arrays, episode_start=episode_start)
         scaled_action, keys_values = self._act(context, deterministic)
         context = with_action(context, scaled_action)._replace(keys_values=keys_values)
-        if state is None:
-            self._context = context
-        action = np.clip(self.unscale_action(scaled_action), self.action_space.low, self.action_space.high)
+        if remembers:
+            self._remembered.remember(before, context)
+        action = self._to_environment(scaled_action)
         return action if vectorized else action.squeeze(axis=0), tuple(context)
+
+    def reset(self) -> None:
+        """Forget the context that `predict` remembers for a caller who passes no `state`."""
+        self._remembered.forget()
+
+    def _to_environment(self, scaled_action: np.ndarray) -> np.ndarray:
+        """From [-1, 1] into the action space, in its own precision."""
+        action = self.unscale_action(scaled_action).astype(self.action_space.dtype)
+        return np.clip(action, self.action_space.low, self.action_space.high)
 
     def _act(self, context: Context, deterministic: bool) -> tuple[np.ndarray, np.ndarray]:
         """The newest step's actions, (B, A) in [-1, 1], and the keys and values to keep."""
         if self.training:
             self.set_training_mode(False)  # goes through all modules
         device = self.device  # SB3 looks for it among the parameters each time
+        network = self.acting_network
         with th.inference_mode():
             windows = Windows(*(th.from_numpy(array).to(device) for array in context.windows))
             if self.kv_cache and self.context_length > 1:
-                hidden, keys_values = self._extend(self._normalized(windows), context.keys_values)
+                hidden, keys_values = self._extend(self.normalization(windows), context.keys_values)
             else:
-                hidden = self.hidden_states(self.acting_network, windows, last_only=True).squeeze(1)
+                hidden = self.hidden_states(network, windows, last_only=True).squeeze(1)
                 keys_values = np.zeros((len(hidden), 0), np.float32)
-            noise = self._acting_noise(
-                windows.timesteps[:, -1], th.from_numpy(context.episode_keys).to(device), deterministic
-            )
-            with threads_for(len(hidden)):
-                actions = self._generate(hidden, noise).clamp(-1.0, 1.0)
-            return actions.cpu().numpy(), keys_values
+            noise = self._acting_noise(context, deterministic).to(device)
+            return network.head(hidden, noise).clamp(-1.0, 1.0).cpu().numpy(), keys_values
 
     def _extend(self, windows: Windows, kept: np.ndarray) -> tuple[th.Tensor, np.ndarray]:
         """
@@ -316,28 +283,42 @@ class SequencePolicy(BasePolicy):
         :param kept: (B, layers, 2, 3 (K - 1), D), or (B, 0) if the last steps were acted without a cache
         :return: (B, D) hidden states, and the new `kept`
         """
-        shape = (len(windows.mask), self.n_layers, 2, TOKENS_PER_STEP * (self.context_length - 1), self.embed_dim)
+        trunk, device = self.acting_network.trunk, windows.mask.device
+        shape = (len(windows.mask), trunk.n_layers, 2, TOKENS_PER_STEP * (self.context_length - 1), trunk.embed_dim)
         n_missing = 0
         if kept.shape != shape:
             kept = np.zeros(shape, np.float32)
             n_missing = int(windows.mask.sum(dim=1).max()) - 1
-        with threads_for(TOKENS_PER_STEP * len(kept)):
-            for n_back in range(n_missing, -1, -1):
-                earlier = Windows(*(x.roll(n_back, dims=1) for x in windows)) if n_back else windows
-                earlier.mask[:, :n_back] = False  # the newest steps went round to the left
-                keys_values = self._keys_values.with_next_step(kept, earlier.mask.device)
-                hidden = self.acting_network.trunk.extend(*earlier, keys_values=keys_values)
-                kept = self._keys_values.keep(keys_values)
+        for n_back in range(n_missing, -1, -1):
+            earlier = Windows(*(x.roll(n_back, dims=1) for x in windows)) if n_back else windows
+            earlier.mask[:, :n_back] = False  # the newest steps went round to the left
+            keys_values = th.empty(*shape[:3], shape[3] + TOKENS_PER_STEP, shape[4], device=device)
+            keys_values[..., : shape[3], :] = th.from_numpy(kept).to(device)
+            hidden = trunk.extend(**earlier._asdict(), keys_values=keys_values)
+            kept = keys_values[..., TOKENS_PER_STEP:, :].cpu().numpy()
         return hidden, kept
 
-    def _acting_noise(self, timestep: th.Tensor, episode_key: th.Tensor, deterministic: bool) -> th.Tensor:
-        """
-        What acting starts from; a policy that needs no noise leaves this as it is.
+    def _acting_noise(self, context: Context, deterministic: bool) -> th.Tensor:
+        """What the newest step's actions start from, (B, noise_dim)."""
+        if deterministic or self.network.head.noise_dim == 0:
+            rows = (context.timesteps[:, -1] + context.episode_keys) % NOISE_ROWS
+            return self.noise_table[th.from_numpy(rows).to(self.noise_table.device)]
+        if self._acting_generator is None:
+            self.seed_noise(self.seed)
+        assert self._acting_generator is not None
+        return standard_normal(len(context.mask), self.network.head.noise_dim, self._acting_generator)
 
-        :param timestep: (B,)
-        :param episode_key: (B,) int64, a number that belongs to the episode
+    def seed_noise(self, seed: int | None) -> None:
         """
-        return th.zeros(len(timestep), self.action_dim, device=self.device)
+        Start the noise of `deterministic=False` anew.
+
+        :param seed: None draws one
+        """
+        self._acting_generator = th.Generator(self.device)
+        if seed is None:
+            self._acting_generator.seed()
+        else:
+            self._acting_generator.manual_seed(seed)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """Actions (B, A) in the environment's range for single steps without a past."""
@@ -346,46 +327,55 @@ class SequencePolicy(BasePolicy):
         arrays, _ = unpack_observation(numbers, self.observation_dim)
         context = empty_context(len(arrays[0]), self.context_length, self.observation_dim, self.action_dim)
         scaled_action, _ = self._act(push(context, *arrays), deterministic)
-        action = self.unscale_action(scaled_action)
-        return th.as_tensor(action, device=self.device)
+        return th.as_tensor(self._to_environment(scaled_action), device=self.device)
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(observation, deterministic)
 
-    def _acting_settings(self) -> dict[str, Any]:
-        """How to act: attributes that may change after training."""
-        return {"kv_cache": self.kv_cache}
+    def acting_settings(self) -> dict[str, Any]:
+        """How to act: what may be changed after training, and is saved with the weights."""
+        head = self.network.head
+        return {"kv_cache": self.kv_cache, **{name: getattr(head, name) for name in head.acting_choices}}
+
+    def set_acting(self, **settings: Any) -> None:
+        """
+        Choose how to act; the trained weights do not depend on it.
+
+        :param settings: some of :meth:`acting_settings`
+        :raises ValueError: an unknown name, or a value out of range
+        """
+        settings = {**self.acting_settings(), **settings}
+        self.network.head.check_acting(**{name: settings[name] for name in self.head_class.acting_choices})
+        for name, value in settings.items():
+            if name == "kv_cache":
+                self.kv_cache = value
+            elif name in self.head_class.acting_choices:
+                setattr(self.network.head, name, value)
+                setattr(self.acting_network.head, name, value)
+            else:
+                raise ValueError(f"{name} is no way of acting; accepted are {', '.join(self.acting_settings())}.")
 
     def get_extra_state(self) -> th.Tensor:
         """The settings of acting as JSON, to be saved with the weights; in a tensor, as all of a state dict is."""
-        return th.tensor(list(json.dumps(self._acting_settings()).encode()), dtype=th.uint8)
+        return th.tensor(list(json.dumps(self.acting_settings()).encode()), dtype=th.uint8)
 
     def set_extra_state(self, state: th.Tensor) -> None:
-        settings = json.loads(bytes(state.tolist()))
-        for name in self._acting_settings().keys() & settings:  # a file of an earlier version may lack some
-            setattr(self, name, settings[name])
+        self.set_acting(**json.loads(bytes(state.tolist())))
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        names = (
-            "context_length",
-            "max_timestep",
-            "embed_dim",
-            "n_layers",
-            "n_heads",
-            "dropout",
-            "timestep_embedding",
-            "weight_decay",
-            "clip_return_to_go",
-            "ema",
-            "kv_cache",
-            "seed",
-        )
-        return dict(
+        spaces_and_schedule = dict(
             observation_space=self.observation_space,
             action_space=self.action_space,
             lr_schedule=self._dummy_schedule,  # not needed to act
-            **{name: getattr(self, name) for name in names},
         )
+        return {**spaces_and_schedule, **self._constructor_arguments, **self.acting_settings()}
+
+
+def _own_parameters() -> set[str]:
+    """The policy's own arguments, without the head's and without what every SB3 policy has."""
+    parameters = inspect.signature(SequencePolicy.__init__).parameters.values()
+    given_by_sb3 = ("self", "observation_space", "action_space", "lr_schedule")
+    return {each.name for each in parameters if each.kind is not each.VAR_KEYWORD and each.name not in given_by_sb3}
 
 
 def standard_normal(n_rows: int, dim: int, generator: th.Generator) -> th.Tensor:

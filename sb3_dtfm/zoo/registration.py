@@ -1,99 +1,82 @@
-"""Enter `dt` and `dtfm` into RL-Zoo's tables of algorithms and of hyperparameter searches."""
+"""Enter the algorithms into RL-Zoo's tables of algorithms and of hyperparameter searches."""
 
+from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import optuna
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
-from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_dtfm import DT, DTFM
-
-OFFLINE_ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"dt": DT, "dtfm": DTFM}
+from sb3_dtfm.algorithms import ALGORITHMS
+from sb3_dtfm.policies import SequencePolicy
 
 # What `--conf-file` accepts besides files and Python packages; None is no `--conf-file` at all.
 PACKAGED_CONFIGS = {None: "sb3_dtfm.zoo_configs", "small": "sb3_dtfm.zoo_configs.small"}
-
-# Everything a trial changes inside `policy_kwargs`. RL-Zoo lets a trial's `policy_kwargs` replace the YAML's as a whole, so
-# the search covers all that the packaged settings choose there.
-_POLICY_KEYS = (
-    "embed_dim",
-    "n_layers",
-    "n_heads",
-    "dropout",
-    "timestep_embedding",
-    "clip_return_to_go",
-    "flow_hidden_dim",
-    "flow_n_layers",
-    "flow_prediction",
-    "flow_tau_exponent",
-    "n_solver_steps",
-)
+OFFLINE_ALGORITHMS = ALGORITHMS
 
 
 def register() -> None:
-    """Add both algorithms in place, so that RL-Zoo's functions see them wherever they were imported."""
-    ALGOS.update(OFFLINE_ALGORITHMS)
-    HYPERPARAMS_SAMPLER.update({"dt": sample_dt_params, "dtfm": sample_dtfm_params})
-    HYPERPARAMS_CONVERTER.update({"dt": convert_params, "dtfm": convert_params})
+    """Add the algorithms in place, so that RL-Zoo's functions see them wherever they were imported."""
+    ALGOS.update(ALGORITHMS)
+    HYPERPARAMS_SAMPLER.update({name: partial(sample_params, name) for name in ALGORITHMS})
+    HYPERPARAMS_CONVERTER.update({name: partial(convert_params, name) for name in ALGORITHMS})
 
 
 def packaged_config(algo: str, name: str | None = None) -> Path:
     """
     Hyperparameter file that comes with the package.
 
-    :param algo: "dt" or "dtfm"
+    :param algo: a key of `ALGORITHMS`; DT's settings, which are those of the trunk, serve a head without a file of its own
     :param name: None for the paper's settings, "small" for those of a 2-core machine
     """
-    return Path(str(resources.files(PACKAGED_CONFIGS[name]).joinpath(f"{algo}.yml")))
+    folder = resources.files(PACKAGED_CONFIGS[name])
+    own = Path(str(folder.joinpath(f"{algo}.yml")))
+    return own if own.is_file() else Path(str(folder.joinpath("dt.yml")))
 
 
-def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+def policy_of(algo: str) -> type[SequencePolicy]:
+    """
+    The policy of an algorithm.
+
+    :param algo: a key of `ALGORITHMS`
+    """
+    return cast(type[SequencePolicy], ALGORITHMS[algo].policy_aliases["MultiInputPolicy"])
+
+
+def convert_params(algo: str, sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
     Constructor arguments from the parameters of a trial.
 
+    RL-Zoo lets a trial's `policy_kwargs` replace the YAML's as a whole, so the search covers all that the packaged settings
+    choose there.
+
+    :param algo: a key of `ALGORITHMS`
     :param sampled_params: as Optuna stores them: flat, powers of two by their exponent
     """
     params = {
         name.removesuffix("_pow"): 2**value if name.endswith("_pow") else value for name, value in sampled_params.items()
     }
-    policy_kwargs = {key: params.pop(key) for key in _POLICY_KEYS if key in params}
+    in_policy = policy_of(algo).parameter_names()
+    policy_kwargs = {name: params.pop(name) for name in list(params) if name in in_policy}
     return {**params, "policy_kwargs": policy_kwargs}
 
 
-def sample_dt_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict) -> dict[str, Any]:
+def sample_params(
+    algo: str, trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+) -> dict[str, Any]:
     """
-    Search space of :class:`~sb3_dtfm.DT`; the signature is RL-Zoo's.
+    Search space: the trunk's, the same for all algorithms, and the head's own.
 
+    :param algo: a key of `ALGORITHMS`
     :param trial: the trial that draws
-    :param n_actions: unused
+    :param n_actions: unused, as the next two: RL-Zoo gives them to every search
     :param n_envs: unused
     :param additional_args: unused
     :return: constructor arguments
     """
-    return convert_params(_sample_trunk(trial))
-
-
-def sample_dtfm_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict) -> dict[str, Any]:
-    """
-    Search space of :class:`~sb3_dtfm.DTFM`: that of DT and the flow head's; the signature is RL-Zoo's.
-
-    :param trial: the trial that draws
-    :param n_actions: unused
-    :param n_envs: unused
-    :param additional_args: unused
-    :return: constructor arguments
-    """
-    flow = {
-        "flow_hidden_dim_pow": trial.suggest_int("flow_hidden_dim_pow", 7, 9),
-        "flow_n_layers": trial.suggest_int("flow_n_layers", 2, 4),
-        "flow_prediction": trial.suggest_categorical("flow_prediction", ["velocity", "action"]),
-        "flow_tau_exponent": trial.suggest_categorical("flow_tau_exponent", [1.0, 2.0]),
-        "n_solver_steps": trial.suggest_categorical("n_solver_steps", [1, 3, 10, 50]),
-    }
-    return convert_params({**_sample_trunk(trial), **flow})
+    return convert_params(algo, {**_sample_trunk(trial), **policy_of(algo).head_class.search_space(trial)})
 
 
 def _sample_trunk(trial: optuna.Trial) -> dict[str, Any]:

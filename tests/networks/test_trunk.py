@@ -3,7 +3,6 @@
 import pytest
 import torch as th
 
-from sb3_dtfm.networks.heads import RegressionHead, masked_mean
 from sb3_dtfm.networks.trunk import SequenceTrunk, causal_mask
 
 B, K, OBSERVATION_DIM, A = 3, 6, 5, 2
@@ -87,22 +86,6 @@ def test_time_steps_beyond_the_longest_share_the_last_embedding(trunk, window):
 def test_every_parameter_gets_a_gradient(trunk, window):
     trunk(**window).square().sum().backward()
     assert [name for name, parameter in trunk.named_parameters() if parameter.grad is None] == []
-
-
-def test_masked_mean_divides_by_valid_steps():
-    values = th.tensor([[[1.0, 3.0], [5.0, 5.0]], [[100.0, 100.0], [0.0, 2.0]]])
-    mask = th.tensor([[True, True], [False, True]])
-    assert masked_mean(values, mask).item() == pytest.approx((2 + 5 + 1) / 3)
-
-
-def test_regression_actions_stay_within_their_bounds():
-    assert RegressionHead(4, 2)(1e3 * th.randn(10, 4)).abs().max() <= 1.0
-
-
-@pytest.mark.parametrize("dropout", [-0.1, 1.0, 1.5])
-def test_dropout_must_be_a_probability_below_one(dropout):
-    with pytest.raises(ValueError, match=f"dropout must lie in .*{dropout}"):
-        SequenceTrunk(OBSERVATION_DIM, A, 10, embed_dim=16, dropout=dropout)
 
 
 def test_width_must_be_a_multiple_of_the_heads():

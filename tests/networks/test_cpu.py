@@ -1,11 +1,14 @@
-"""Dropout's own masks: their probability, their mean, their independence and their source of randomness."""
+"""What only makes a CPU faster, against torch's own way."""
 
+import numpy as np
 import pytest
 import torch as th
 from torch.nn import functional as F
 
-from sb3_dtfm.networks.dropout import dropout, dropout_add, keep_mask
+from sb3_dtfm.networks.cpu import FEW_ROWS, LARGE_WEIGHT, Linear, dropout, dropout_add, keep_mask
 from sb3_dtfm.networks.trunk import attention
+
+WIDE = -(-LARGE_WEIGHT // 5)  # outputs that make five inputs a large weight
 
 
 @pytest.mark.parametrize("probability", [0.0, 0.1, 0.5, 0.9])
@@ -67,3 +70,36 @@ def test_attention_with_dropout_is_torchs_attention_but_for_the_mask(monkeypatch
     assert th.allclose(ours, theirs, atol=1e-6)
     gradients = [th.autograd.grad(y.square().sum(), (query, key, value)) for y in (ours, theirs)]
     assert all(th.allclose(a, b, atol=1e-5) for a, b in zip(*gradients, strict=True))
+
+
+@pytest.mark.parametrize("shape", [(5,), (1, 5), (3, 5), (1, 3, 5), (FEW_ROWS, 5), (FEW_ROWS + 1, 5), (2, 4, 5), (0, 5)])
+@pytest.mark.parametrize("bias", [True, False])
+def test_few_rows_give_what_torch_gives(shape, bias):
+    layer, x = Linear(5, WIDE, bias=bias), th.randn(shape)
+    with th.inference_mode():
+        y = layer(x)
+    assert y.shape == (*shape[:-1], WIDE)
+    assert th.allclose(y, F.linear(x, layer.weight, layer.bias), atol=1e-6)
+
+
+@pytest.mark.parametrize(("width", "by_numpy"), [(WIDE, True), (7, False)])
+def test_numpy_multiplies_large_weights_alone(width, by_numpy, monkeypatch):
+    products = []
+    monkeypatch.setattr(np, "dot", lambda a, b, out: products.append(np.matmul(a, b, out=out)))
+    with th.inference_mode():
+        Linear(5, width)(th.randn(1, 5))
+    assert len(products) == by_numpy
+
+
+def test_rows_that_are_not_contiguous_are_read_as_they_are():
+    layer, x = Linear(5, WIDE), th.randn(5, 3).t()
+    with th.inference_mode():
+        assert th.allclose(layer(x), F.linear(x, layer.weight, layer.bias), atol=1e-6)
+
+
+def test_gradients_and_other_precisions_take_torchs_way():
+    layer, x = Linear(5, WIDE), th.randn(1, 5, requires_grad=True)
+    layer(x).sum().backward()
+    assert th.allclose(x.grad, layer.weight.sum(dim=0).unsqueeze(0), atol=1e-6)
+    with th.inference_mode():
+        assert layer.double()(x.double()).dtype == th.float64

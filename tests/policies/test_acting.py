@@ -6,7 +6,9 @@ import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_dtfm import DT, DTFM
+from sb3_dtfm.heads import FlowHead
 from sb3_dtfm.policies import DTFMPolicy
+from sb3_dtfm.windows import empty_context
 from tests.conftest import TINY_FLOW_POLICY, TINY_POLICY, make_env
 
 ALGORITHMS = [(DT, TINY_POLICY), (DTFM, TINY_FLOW_POLICY)]
@@ -120,19 +122,18 @@ def test_fresh_noise_differs_and_deterministic_noise_is_not_zero(cheetah_buffer)
     observation, _ = make_env().reset(seed=0)
     drawn = [model.predict(observation, deterministic=False)[0] for _ in range(2)]
     assert not np.allclose(*drawn)
-    timesteps, episode = th.tensor([0, 1, 7]), th.tensor([5, 5, 5])
-    noise = model.policy._acting_noise(timesteps, episode, deterministic=True)
+    context = empty_context(3, 20, 17, 6)._replace(episode_keys=np.array([5, 5, 5]))
+    context.timesteps[:, -1] = [0, 1, 7]
+    noise = model.policy._acting_noise(context, deterministic=True)
     assert noise.abs().min() > 0
     assert len(noise.unique(dim=0)) == 3
-    assert th.equal(noise, model.policy._acting_noise(timesteps, episode, deterministic=True))
+    assert th.equal(noise, model.policy._acting_noise(context, deterministic=True))
 
 
 def test_episodes_that_start_elsewhere_have_another_deterministic_noise(cheetah_buffer, monkeypatch):
     drawn = []
-    generate = DTFMPolicy._generate
-    monkeypatch.setattr(
-        DTFMPolicy, "_generate", lambda self, hidden, noise: drawn.append(noise) or generate(self, hidden, noise)
-    )
+    forward = FlowHead.forward
+    monkeypatch.setattr(FlowHead, "forward", lambda self, hidden, noise: drawn.append(noise) or forward(self, hidden, noise))
     model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=TINY_FLOW_POLICY, seed=0)
     starts = np.random.default_rng(0).normal(size=(50, 17)).astype(np.float32)
     starts[1] = starts[0]
@@ -150,9 +151,9 @@ def test_episodes_that_start_elsewhere_have_another_deterministic_noise(cheetah_
 
 def test_normalisation_is_the_datasets(model, cheetah_buffer):
     observations = cheetah_buffer.observations.numpy()
-    assert np.allclose(model.policy.observation_mean, observations.mean(0), atol=1e-4)
-    assert np.allclose(model.policy.observation_std, observations.std(0), rtol=1e-3)
-    assert model.policy.return_scale == cheetah_buffer.returns_to_go.abs().max()
+    assert np.allclose(model.policy.normalization.observation_mean, observations.mean(0), atol=1e-4)
+    assert np.allclose(model.policy.normalization.observation_std, observations.std(0), rtol=1e-3)
+    assert model.policy.normalization.return_scale == cheetah_buffer.returns_to_go.abs().max()
 
 
 def test_weight_decay_spares_biases_norms_and_embeddings(model):
@@ -204,7 +205,7 @@ def test_a_state_of_other_environments_is_refused(model):
 
 def test_a_cache_gives_the_same_actions_until_the_window_slides(model):
     exact = roll_plain(model, 12)
-    model.policy.kv_cache = True
+    model.policy.set_acting(kv_cache=True)
     cached = roll_plain(model, 12)
     assert np.allclose(cached[:5], exact[:5], atol=1e-4)
     assert not np.allclose(cached[5:], exact[5:], atol=1e-4)
@@ -212,7 +213,7 @@ def test_a_cache_gives_the_same_actions_until_the_window_slides(model):
 
 
 def test_a_call_that_fails_leaves_the_cache_as_it_was(model, monkeypatch):
-    model.policy.kv_cache = True
+    model.policy.set_acting(kv_cache=True)
     observation, _ = make_env().reset(seed=0)
     _, state = model.predict(observation, deterministic=True)
     following = {**observation, "timestep": np.array([1])}
@@ -236,13 +237,13 @@ def test_a_cache_that_starts_in_mid_episode_is_filled_from_the_window(model):
     observations = {key: np.stack([value] * 2) for key, value in observation.items()}
     states, actions = [], []
     for kv_cache in (True, False):
-        model.policy.kv_cache = kv_cache
+        model.policy.set_acting(kv_cache=kv_cache)
         state = None
         for t in range(4):
             observations["timestep"][:] = [[t], [max(0, t - 2)]]
             _, state = model.predict(observations, state=state, episode_start=np.array([t == 0, t <= 2]), deterministic=True)
         states.append(state)
-    model.policy.kv_cache = True
+    model.policy.set_acting(kv_cache=True)
     observations["timestep"][:] = [[4], [2]]
     for state in states:
         actions.append(model.predict(observations, state=state, episode_start=np.zeros(2, bool), deterministic=True)[0])
@@ -251,7 +252,7 @@ def test_a_cache_that_starts_in_mid_episode_is_filled_from_the_window(model):
 
 def test_predict_with_a_cache_is_a_pure_function(model):
     """Also over many steps, and when an old state is taken up again: what one call appends, another never sees."""
-    model.policy.kv_cache = True
+    model.policy.set_acting(kv_cache=True)
     observation, _ = make_env().reset(seed=0)
 
     def go_on(state, first, n_steps, shift):
@@ -273,7 +274,7 @@ def test_predict_with_a_cache_is_a_pure_function(model):
 
 
 def test_parallel_environments_with_a_cache_act_as_they_would_alone(model):
-    model.policy.kv_cache = True
+    model.policy.set_acting(kv_cache=True)
     test_parallel_environments_act_as_they_would_alone(model)
 
 
@@ -282,8 +283,7 @@ def test_one_step_acting_is_one_evaluation_saved_with_the_model(cheetah_buffer, 
     model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=policy_kwargs, batch_size=16, seed=0).learn(5)
     model.save(tmp_path / "model.zip")
     loaded = DTFM.load(tmp_path / "model.zip")
-    assert loaded.policy.solver == "one_step"
-    assert loaded.policy.kv_cache
+    assert loaded.policy.acting_settings() == {"solver": "one_step", "n_solver_steps": 4, "kv_cache": True}
     assert np.array_equal(roll_plain(model, 8), roll_plain(loaded, 8))
     model.policy.set_solver("euler", 10)
     assert not np.allclose(roll_plain(model, 8), roll_plain(loaded, 8))
@@ -292,10 +292,10 @@ def test_one_step_acting_is_one_evaluation_saved_with_the_model(cheetah_buffer, 
 def test_a_way_of_acting_that_was_chosen_after_training_is_saved(cheetah_buffer, tmp_path):
     model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=TINY_FLOW_POLICY, seed=0)
     model.policy.set_solver("heun", 3)
-    model.policy.kv_cache = True
+    model.policy.set_acting(kv_cache=True)
     model.save(tmp_path / "model.zip")
     loaded = DTFM.load(tmp_path / "model.zip")
-    assert (loaded.policy.solver, loaded.policy.n_solver_steps, loaded.policy.kv_cache) == ("heun", 3, True)
+    assert loaded.policy.acting_settings() == {"solver": "heun", "n_solver_steps": 3, "kv_cache": True}
     assert np.array_equal(roll_plain(model, 8), roll_plain(loaded, 8))
 
 
@@ -313,7 +313,7 @@ def test_the_one_step_network_changes_nothing_else(cheetah_buffer):
         model = DTFM(
             "MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=policy_kwargs, batch_size=8, max_grad_norm=0.5, seed=0
         ).learn(5)
-        weights.append({name: p for name, p in model.policy.network.named_parameters() if "jump" not in name})
+        weights.append({name: p for name, p in model.policy.network.named_parameters() if "head.one_step" not in name})
     with_it, without_it = weights
     assert with_it.keys() == without_it.keys()
     assert all(th.equal(with_it[name], without_it[name]) for name in with_it)

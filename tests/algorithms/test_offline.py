@@ -210,15 +210,14 @@ def test_action_prediction_and_tau_near_the_noise_train_and_are_saved(cheetah_bu
     batch = model.buffer.sample(4, 3, th.Generator().manual_seed(0))
     noise, tau = model.policy.draw_noise(batch, th.Generator().manual_seed(0))
     assert (noise.shape, tau.shape) == ((4, 3, 6), (4, 3))
-    model.policy.flow_tau_exponent = 1.0
+    model.policy.network.head.flow_tau_exponent = 1.0
     _, uniform = model.policy.draw_noise(batch, th.Generator().manual_seed(0))
     th.testing.assert_close(tau, uniform.square())
-    model.policy.flow_tau_exponent = 2.0
+    model.policy.network.head.flow_tau_exponent = 2.0
     model.learn(3).save(tmp_path / "model")
-    policy = DTFM.load(tmp_path / "model").policy
-    assert (policy.flow_prediction, policy.flow_tau_exponent) == ("action", 2.0)
-    with pytest.raises(ValueError, match="flow_tau_exponent must be positive and finite, got 0"):
-        DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs={**TINY_FLOW_POLICY, "flow_tau_exponent": 0})
+    head = DTFM.load(tmp_path / "model").policy.network.head
+    assert head.regression is not None
+    assert head.flow_tau_exponent == 2.0
 
 
 @pytest.mark.parametrize(("algorithm", "policy_kwargs"), ALGORITHMS, ids=IDS)
@@ -235,8 +234,6 @@ def test_without_time_steps_and_with_more_starts(algorithm, policy_kwargs, cheet
     loaded = algorithm.load(tmp_path / "model")
     assert loaded.timestep_exponent == 1.5
     assert loaded.policy.network.trunk.embed_timestep is None
-    with pytest.raises(ValueError, match="timestep_exponent must be positive and finite, got -1"):
-        make_model(algorithm, cheetah_buffer, timestep_exponent=-1.0)
 
 
 def test_learning_rate_warms_up_and_decays(cheetah_buffer):
@@ -270,7 +267,7 @@ def test_gradients_are_clipped_to_their_norm(cheetah_buffer):
 
 @pytest.mark.parametrize("algorithm", [DT, DTFM], ids=IDS)
 def test_every_parameter_gets_a_gradient(algorithm, cheetah_buffer):
-    extra = {"regression_coef": 0.5} if algorithm is DTFM else {}
+    extra = {"policy_kwargs": {**TINY_FLOW_POLICY, "regression_coef": 0.5}} if algorithm is DTFM else {}
     model = make_model(algorithm, cheetah_buffer, **extra).learn(1)
     assert [name for name, p in model.policy.network.named_parameters() if p.grad is None] == []
 
@@ -313,26 +310,11 @@ def test_a_dataset_that_does_not_fit_the_env_names_both(cheetah_buffer):
     from sb3_dtfm.envs import ReturnToGoWrapper
 
     hopper = ReturnToGoWrapper(gym.make("Hopper-v5"), 100.0)
-    with pytest.raises(DatasetError, match=r"random cheetah.*\(17,\).*environment gives.*\(11,\)"):
+    with pytest.raises(DatasetError, match=r"random cheetah.*\(17,\).*environment's are.*\(11,\)"):
         make_model(DT, cheetah_buffer, env=hopper)
     wider = TrajectoryBuffer.from_trajectories(record_random_episodes(1), spaces.Box(-2, 2, (6,)), source="wide actions")
-    with pytest.raises(DatasetError, match=r"wide actions.*Box\(-2.0, 2.0.*environment takes Box\(-1.0, 1.0"):
+    with pytest.raises(DatasetError, match=r"wide actions.*Box\(-2.0, 2.0.*environment's are Box\(-1.0, 1.0"):
         make_model(DT, wider, env=make_env())
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("precision", "float8"),
-        ("learning_rate_schedule", "step"),
-        ("batch_size", 0),
-        ("ema_decay", 1.0),
-        ("dataset_fraction", 0),
-    ],
-)
-def test_arguments_out_of_range_are_refused_by_name(name, value, cheetah_buffer):
-    with pytest.raises(ValueError, match=f"{name}.*{value}"):
-        make_model(DT, cheetah_buffer, **{name: value})
 
 
 @pytest.mark.parametrize("env", [None, "wrapped"])
@@ -364,7 +346,7 @@ def loss_curve(buffer, n_steps=500, **kwargs):
 def test_fast_paths_learn_as_plain_float32_does(cheetah_buffer, monkeypatch):
     """Same batches, other dropout masks: the loss curves differ no more than two streams of plain dropout do (2.4 %)."""
     fast = [loss_curve(cheetah_buffer, precision=precision) for precision in ("float32", "bfloat16")]
-    monkeypatch.setattr("sb3_dtfm.networks.dropout._draws_masks_here", lambda x: False)
+    monkeypatch.setattr("sb3_dtfm.networks.cpu._draws_masks_here", lambda x: False)
     monkeypatch.setattr("sb3_dtfm.networks.trunk.attention", plain_attention)
     plain = loss_curve(cheetah_buffer, precision="float32")
     assert plain[-1] < 0.5 * plain[0]

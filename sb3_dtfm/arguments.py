@@ -1,0 +1,74 @@
+"""Arguments that a user gives, checked by name: one way to say what is accepted, one message for what is not."""
+
+import math
+import numbers
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+
+class Number(NamedTuple):
+    """
+    A number in a range.
+
+    :param low: smallest value
+    :param high: largest value
+    :param whole: only whole numbers
+    :param above_low: `low` itself is not accepted
+    :param below_high: `high` itself is not accepted
+    :param optional: None is accepted, too
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+    whole: bool = False
+    above_low: bool = False
+    below_high: bool = False
+    optional: bool = False
+
+    def accepts(self, value: Any) -> bool:
+        """Whether a value is such a number; True and False, NaN and infinity are none."""
+        if value is None:
+            return self.optional
+        kind = numbers.Integral if self.whole else numbers.Real
+        if not isinstance(value, kind) or isinstance(value, bool) or not math.isfinite(value):
+            return False
+        at_least = value > self.low if self.above_low else value >= self.low
+        return at_least and (value < self.high if self.below_high else value <= self.high)
+
+    def __str__(self) -> str:
+        kind = "whole number" if self.whole else "number"
+        if math.isinf(self.high):
+            limits = "" if math.isinf(self.low) else f" {'above' if self.above_low else 'of at least'} {self.low:g}"
+            text = f"a {'' if limits else 'finite '}{kind}{limits}"
+        else:
+            text = (
+                f"a {kind} in {'(' if self.above_low else '['}{self.low:g}, {self.high:g}{')' if self.below_high else ']'}"
+            )
+        return f"{text}, or None" if self.optional else text
+
+
+class Choice(tuple[Any, ...]):
+    """One of some values."""
+
+    def accepts(self, value: Any) -> bool:
+        return any(type(value) is type(one) and value == one for one in self)
+
+    def __str__(self) -> str:
+        return f"one of {', '.join(map(str, self))}"
+
+
+COUNT = Number(low=1, whole=True)
+POSITIVE = Number(low=0, above_low=True)
+NOT_NEGATIVE = Number(low=0)
+PROBABILITY_BELOW_1 = Number(low=0, high=1, below_high=True)
+
+
+def check_arguments(given: Mapping[str, Any], accepted: Mapping[str, Number | Choice]) -> None:
+    """
+    :param given: values by name; others than `accepted` are left alone
+    :param accepted: what each name may be
+    :raises ValueError: names the argument, what was given and what is accepted
+    """
+    for name, rule in accepted.items():
+        if not rule.accepts(given[name]):
+            raise ValueError(f"{name} must be {rule}, got {given[name]!r}.")

@@ -1,0 +1,107 @@
+"""What the policy, the algorithm, RL-Zoo and the benchmark ask of a head."""
+
+import inspect
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+import torch as th
+from torch import nn
+
+
+class ActionHead(nn.Module, ABC):
+    """
+    From hidden states to actions in [-1, 1].
+
+    A head's options are the keyword-only arguments of its constructor: users give them among `policy_kwargs`.
+
+    :param embed_dim: width D of the hidden states
+    :param action_dim: A
+
+    :cvar algorithm: name of the algorithm that trunk and head make together, for example "DTFM"
+    :cvar acting_choices: options that may be changed after training, attributes of the head; `check_acting` checks them
+    :ivar noise_dim: numbers of standard normal noise that an action starts from, 0 if none
+    """
+
+    algorithm: ClassVar[str]
+    acting_choices: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, embed_dim: int, action_dim: int) -> None:
+        super().__init__()
+        self.embed_dim = embed_dim
+        self.action_dim = action_dim
+        self.noise_dim = 0
+
+    @classmethod
+    def options(cls) -> dict[str, Any]:
+        """The head's options with their defaults."""
+        parameters = inspect.signature(cls).parameters.values()
+        return {each.name: each.default for each in parameters if each.kind is inspect.Parameter.KEYWORD_ONLY}
+
+    def check_acting(self, **choices: Any) -> None:
+        """
+        :param choices: all of `acting_choices`
+        :raises ValueError: names the choice, what was given and what is accepted
+        """
+
+    def draw_noise(self, actions: th.Tensor, generator: th.Generator) -> tuple[th.Tensor, ...]:
+        """
+        What the loss draws at random, drawn apart from it, so that the loss is a plain function.
+
+        :param actions: (B, K, A), of the batch
+        :param generator: on the device of `actions`
+        :return: further arguments of :meth:`loss`, each (B, ...)
+        """
+        return ()
+
+    @abstractmethod
+    def loss(
+        self, hidden: th.Tensor, actions: th.Tensor, mask: th.Tensor, *noise: th.Tensor
+    ) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        """
+        :param hidden: (B, K, D)
+        :param actions: (B, K, A) in [-1, 1]
+        :param mask: (B, K) bool, False on padded steps
+        :param noise: what :meth:`draw_noise` gave
+        :return: the loss to minimise, a mean over valid steps, and its parts by their logged names
+        """
+
+    def part_masks(self, mask: th.Tensor) -> dict[str, th.Tensor]:
+        """
+        Parts of the loss that are means over some of the valid steps only; each is a plain summand of the loss.
+
+        :param mask: (B, K) bool, of a batch
+        :return: the steps of such a part (B, ...) bool, by its logged name
+        """
+        return {}
+
+    def unclipped_parameters(self) -> list[nn.Parameter]:
+        """Parameters that neither count into the gradient's norm nor are clipped with the others."""
+        return []
+
+    @abstractmethod
+    def forward(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        """
+        :param hidden: (..., D)
+        :param noise: (..., noise_dim), standard normal
+        :return: actions (..., A), to be clipped to [-1, 1]
+        """
+
+    @staticmethod
+    def search_space(trial: Any) -> dict[str, Any]:
+        """
+        Options that a hyperparameter search draws.
+
+        :param trial: Optuna's; numbers that are powers of two are drawn by their exponent, named `<option>_pow`
+        """
+        return {}
+
+
+def masked_mean(values: th.Tensor, mask: th.Tensor) -> th.Tensor:
+    """
+    Mean over valid steps and all action dimensions.
+
+    :param values: (..., A)
+    :param mask: (...) bool, at least one True
+    """
+    per_step = values.float().mean(dim=-1)
+    return (per_step * mask).sum() / mask.sum()

@@ -1,0 +1,224 @@
+"""
+The flow-matching head on one page: path, loss, distillation, solver.
+
+Time runs one way everywhere: tau = 0 is noise, tau = 1 is the action.
+"""
+
+from typing import Any
+
+import torch as th
+from torch import nn
+
+from sb3_dtfm.arguments import COUNT, NOT_NEGATIVE, POSITIVE, Choice, check_arguments
+from sb3_dtfm.heads.base import ActionHead, masked_mean
+from sb3_dtfm.heads.regression import RegressionHead
+from sb3_dtfm.networks.cpu import Linear
+from sb3_dtfm.networks.film import FilmNetwork, VectorField
+from sb3_dtfm.networks.solvers import SOLVERS, integrate, solver_times
+
+# Not an ODE solver: a network of its own that has learnt where the solver would end.
+ONE_STEP = "one_step"
+# Solver steps whose end that network learns.
+DISTILLED_STEPS = 16
+# Newest steps of each window that it learns from: where acting asks it, and few enough to cost little.
+ONE_STEP_POSITIONS = 4
+
+OPTIONS = {
+    "flow_hidden_dim": COUNT,
+    "flow_n_layers": COUNT,
+    "flow_prediction": Choice(("velocity", "action")),
+    "flow_tau_exponent": POSITIVE,
+    "regression_coef": NOT_NEGATIVE,
+    "one_step": Choice((True, False)),
+}
+ACTING = {"solver": Choice((*SOLVERS, ONE_STEP)), "n_solver_steps": COUNT}
+
+
+def interpolate(noise: th.Tensor, action: th.Tensor, tau: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """
+    Point and velocity at time tau on the straight path from noise to action (Lipman et al., 2023, optimal transport).
+
+    :param noise: (..., A), the path's start
+    :param action: (..., A), the path's end
+    :param tau: (..., 1) in [0, 1]
+    :return: the point (1 - tau) noise + tau action, and the constant velocity action - noise, both (..., A)
+    """
+    velocity = action - noise
+    return noise + tau * velocity, velocity
+
+
+class FlowHead(ActionHead):
+    """
+    Flow-matching head: the hidden state conditions a vector field that carries Gaussian noise to the action.
+
+    A head that predicts the action x1 instead of the velocity has a bounded target, which does not depend on the noise where
+    the data have one mode, and which the last Euler step lands on; the velocity (x1 - x) / (1 - tau) follows from it. The
+    prediction is tanh(W h + b + FiLM network), whose last term starts at zero: training starts from Decision Transformer's
+    regression, and what noise and time have to add to it is learned.
+
+    With `one_step` a second network learns where the flow ends, so that an action can take one evaluation instead of one per
+    solver step. It learns from the field and gives nothing back: trunk and field are what they are without it.
+
+    :param embed_dim: D
+    :param action_dim: A
+    :param flow_hidden_dim: width of the vector field's hidden layers
+    :param flow_n_layers: number of its hidden layers
+    :param flow_prediction: what the head learns of the path: its "velocity", or the "action" it leads to
+    :param flow_tau_exponent: tau of the loss is u to this power for u uniform in [0, 1]: above 1 it is more often near the
+        noise, where the action has to come from the hidden state
+    :param solver: how to act: an ODE solver, euler, midpoint, heun or rk4; or one_step, the network that learnt its end
+    :param n_solver_steps: steps of the ODE solver
+    :param one_step: train that network
+    :param regression_coef: weight of an auxiliary regression of the action from the hidden state; 0 leaves it out
+    :raises ValueError: an option out of range, by name
+    """
+
+    algorithm = "DTFM"
+    acting_choices = ("solver", "n_solver_steps")
+
+    def __init__(
+        self,
+        embed_dim: int,
+        action_dim: int,
+        *,
+        flow_hidden_dim: int = 512,
+        flow_n_layers: int = 3,
+        flow_prediction: str = "velocity",
+        flow_tau_exponent: float = 1.0,
+        solver: str = "euler",
+        n_solver_steps: int = 50,
+        one_step: bool = True,
+        regression_coef: float = 0.0,
+    ) -> None:
+        super().__init__(embed_dim, action_dim)
+        check_arguments(locals(), OPTIONS)
+        self.noise_dim = action_dim
+        self.flow_tau_exponent = flow_tau_exponent
+        self.regression_coef = regression_coef
+        sizes = (action_dim, embed_dim, flow_hidden_dim, flow_n_layers)
+        self.vector_field = VectorField(*sizes)
+        self.regression = Linear(embed_dim, action_dim) if flow_prediction == "action" else None
+        if self.regression is not None:
+            nn.init.zeros_(self.vector_field.output.weight)
+            nn.init.zeros_(self.vector_field.output.bias)
+        self.one_step = FilmNetwork(*sizes) if one_step else None
+        self.auxiliary = RegressionHead(embed_dim, action_dim) if regression_coef > 0 else None
+        self.check_acting(solver=solver, n_solver_steps=n_solver_steps)
+        self.solver = solver
+        self.n_solver_steps = n_solver_steps
+
+    def check_acting(self, **choices: Any) -> None:
+        check_arguments(choices, ACTING)
+        if choices["solver"] == ONE_STEP and self.one_step is None:
+            raise ValueError(f"solver={ONE_STEP!r} needs a model that was trained with policy_kwargs=dict(one_step=True).")
+
+    def draw_noise(self, actions: th.Tensor, generator: th.Generator) -> tuple[th.Tensor, ...]:
+        noise = th.randn(actions.shape, generator=generator, device=actions.device)
+        tau = th.rand(actions.shape[:2], generator=generator, device=actions.device) ** self.flow_tau_exponent
+        return noise, tau
+
+    def loss(
+        self, hidden: th.Tensor, actions: th.Tensor, mask: th.Tensor, *noise: th.Tensor
+    ) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        starts, tau = noise
+        loss = self.flow_loss(hidden, actions, mask, starts, tau)
+        parts = {"flow_loss": loss}
+        if self.auxiliary is not None:
+            regression_loss, auxiliary_parts = self.auxiliary.loss(hidden, actions, mask)
+            loss, parts = loss + self.regression_coef * regression_loss, {**parts, **auxiliary_parts}
+        if self.one_step is not None:
+            newest = slice(-ONE_STEP_POSITIONS, None)
+            parts["one_step_loss"] = self.one_step_loss(hidden[:, newest], mask[:, newest], starts[:, newest])
+            loss = loss + parts["one_step_loss"]
+        return loss, parts
+
+    def flow_loss(
+        self, hidden: th.Tensor, actions: th.Tensor, mask: th.Tensor, noise: th.Tensor, tau: th.Tensor
+    ) -> th.Tensor:
+        """
+        Conditional flow matching (Lipman et al., 2023): squared error on the path from noise to action.
+
+        Of the velocity, or of the action, which weighs the velocity's by (1 - tau)^2.
+
+        :param hidden: (B, K, D)
+        :param actions: (B, K, A) in [-1, 1]
+        :param mask: (B, K) bool
+        :param noise: (B, K, A), standard normal
+        :param tau: (B, K) in [0, 1]
+        :return: mean squared error over valid steps
+        """
+        x, velocity = interpolate(noise, actions, tau.unsqueeze(-1))
+        output = self.vector_field(x, self.vector_field.film_condition(hidden) + self.vector_field.time_share(tau))
+        error = output - velocity if self.regression is None else (self.regression(hidden) + output).tanh() - actions
+        return masked_mean(error.square(), mask)
+
+    def one_step_loss(self, hidden: th.Tensor, mask: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        """
+        Distillation (Luhman and Luhman, 2021): squared error against where the solver ends, from the same noise.
+
+        :param hidden: (B, K, D); no gradient flows into it
+        :param mask: (B, K) bool
+        :param noise: (B, K, A), standard normal
+        :return: mean squared error over valid steps
+        """
+        hidden = hidden.detach()
+        with th.no_grad():
+            target = self.solve(hidden, noise, "euler", DISTILLED_STEPS).clamp(-1.0, 1.0)
+        return masked_mean((self.jump(hidden, noise) - target).square(), mask)
+
+    def forward(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        if self.solver == ONE_STEP:
+            return self.jump(hidden, noise)
+        return self.solve(hidden, noise, self.solver, self.n_solver_steps)
+
+    def jump(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        """From noise (..., A) to actions (..., A) in one step."""
+        assert self.one_step is not None
+        return noise + self.one_step(noise, self.one_step.film_condition(hidden))
+
+    def solve(self, hidden: th.Tensor, noise: th.Tensor, solver: str, n_solver_steps: int) -> th.Tensor:
+        """
+        Carry noise to actions along the vector field.
+
+        The FiLM map of [psi(tau), h] is linear: the share of h is computed once, that of tau once for all times.
+
+        :param hidden: (..., D)
+        :param noise: (..., A), standard normal
+        :param solver: a key of `SOLVERS`
+        :param n_solver_steps: number of steps
+        :return: (..., A), in [-1, 1] as far as it was learnt; the policy clips
+        """
+        times = solver_times(solver, n_solver_steps, hidden.device)
+        condition, time_shares = self.vector_field.film_condition(hidden), self.vector_field.time_share(times)
+        regressed = None if self.regression is None else self.regression(hidden)
+        velocity = noise
+
+        def field(x: th.Tensor, tau: float) -> th.Tensor:
+            nonlocal velocity
+            i = round(tau * (len(times) - 1))
+            if regressed is None:
+                velocity = self.vector_field(x, condition + time_shares[i])
+            elif i < len(times) - 1:
+                action = (regressed + self.vector_field(x, condition + time_shares[i])).tanh()
+                velocity = (action - x) / (1.0 - tau)
+            # Heun and RK4 look at tau = 1 too, where a predicted action gives 0 / 0: the slope before it stands in.
+            return velocity
+
+        return integrate(field, noise, solver, n_solver_steps)
+
+    def part_masks(self, mask: th.Tensor) -> dict[str, th.Tensor]:
+        return {"one_step_loss": mask[:, -ONE_STEP_POSITIONS:]} if self.one_step is not None else {}
+
+    def unclipped_parameters(self) -> list[nn.Parameter]:
+        """The one-step network's: it must not change how the others are clipped."""
+        return [] if self.one_step is None else list(self.one_step.parameters())
+
+    @staticmethod
+    def search_space(trial: Any) -> dict[str, Any]:
+        return {
+            "flow_hidden_dim_pow": trial.suggest_int("flow_hidden_dim_pow", 7, 9),
+            "flow_n_layers": trial.suggest_int("flow_n_layers", 2, 4),
+            "flow_prediction": trial.suggest_categorical("flow_prediction", ["velocity", "action"]),
+            "flow_tau_exponent": trial.suggest_categorical("flow_tau_exponent", [1.0, 2.0]),
+            "n_solver_steps": trial.suggest_categorical("n_solver_steps", [1, 3, 10, 50]),
+        }

@@ -1,0 +1,80 @@
+"""MLPs that are scaled and shifted from outside: the vector field of a flow, and its short cut."""
+
+import math
+
+import torch as th
+from torch import nn
+from torch.nn import functional as F
+
+from sb3_dtfm.networks.cpu import Linear
+
+
+def sinusoidal_embedding(tau: th.Tensor, embedding_dim: int) -> th.Tensor:
+    """
+    Sines and cosines of tau at frequencies from 1 to 100 rad, geometrically spaced.
+
+    Higher ones would change faster than a solver's step can follow.
+
+    :param tau: (...) in [0, 1]
+    :param embedding_dim: even
+    :return: (..., embedding_dim)
+    """
+    half = embedding_dim // 2
+    frequencies = th.exp(th.linspace(0.0, math.log(100.0), half, device=tau.device))
+    angles = tau.unsqueeze(-1) * frequencies
+    return th.cat((angles.sin(), angles.cos()), dim=-1)
+
+
+class FilmNetwork(nn.Module):
+    """
+    MLP from A to A numbers whose every hidden layer is scaled and shifted from outside (FiLM, Perez et al., 2018).
+
+    :param action_dim: A
+    :param condition_dim: width D of the hidden state h
+    :param hidden_dim: width of the hidden layers
+    :param n_layers: number of hidden layers
+    """
+
+    def __init__(self, action_dim: int, condition_dim: int, hidden_dim: int = 512, n_layers: int = 3) -> None:
+        super().__init__()
+        self.n_layers = n_layers
+        self.film_dim = 2 * hidden_dim * n_layers
+        sizes = [action_dim] + [hidden_dim] * n_layers
+        self.layers = nn.ModuleList(Linear(sizes[i], sizes[i + 1]) for i in range(n_layers))
+        self.film_condition = Linear(condition_dim, self.film_dim)
+        self.output = Linear(hidden_dim, action_dim)
+
+    def forward(self, x: th.Tensor, film: th.Tensor) -> th.Tensor:
+        """
+        :param x: (..., A)
+        :param film: (..., 2 * hidden_dim * n_layers), scales and shifts: `film_condition(h)` and what is added to it
+        :return: (..., A)
+        """
+        for layer, layer_film in zip(self.layers, film.chunk(self.n_layers, dim=-1), strict=True):
+            scale, shift = layer_film.chunk(2, dim=-1)
+            x = F.silu(layer(x) * (1.0 + scale) + shift)
+        return self.output(x)
+
+
+class VectorField(FilmNetwork):
+    """
+    Velocity v(x, tau, h): a FiLM network whose scales and shifts come from tau and h.
+
+    The FiLM map of [psi(tau), h] is linear, so its two halves are kept apart: the half of h is computed once per action,
+    the half of tau once for all times of a solver.
+
+    :param time_embedding_dim: size of psi(tau)
+
+    The other parameters are those of :class:`FilmNetwork`.
+    """
+
+    def __init__(
+        self, action_dim: int, condition_dim: int, hidden_dim: int = 512, n_layers: int = 3, time_embedding_dim: int = 128
+    ) -> None:
+        super().__init__(action_dim, condition_dim, hidden_dim, n_layers)
+        self.time_embedding_dim = time_embedding_dim
+        self.film_time = Linear(time_embedding_dim, self.film_dim, bias=False)
+
+    def time_share(self, tau: th.Tensor) -> th.Tensor:
+        """The share of times in [0, 1], (...), in all scales and shifts: (..., 2 * hidden_dim * n_layers)."""
+        return self.film_time(sinusoidal_embedding(tau, self.time_embedding_dim))

@@ -1,0 +1,67 @@
+"""What a policy remembers between calls of `predict` that pass no `state`."""
+
+import warnings
+
+import numpy as np
+
+from sb3_dtfm.windows import Context
+
+ADVICE = (
+    "Without `state`, predict() remembers the context of one caller. Pass the `state` that it returns where several "
+    "environments take turns, and call model.policy.reset() to start anew."
+)
+
+
+class RememberedContext:
+    """The context of one caller, who steps one environment (or several in parallel) and passes nothing back."""
+
+    def __init__(self) -> None:
+        self._before: Context | None = None
+        self._after: Context | None = None
+        self._has_warned = False
+
+    def forget(self) -> None:
+        """Start anew with the next call."""
+        self._before = self._after = None
+
+    def recall(self, observation: np.ndarray, timestep: np.ndarray) -> Context | None:
+        """
+        What a new observation follows: the context after the last call, or before it where the same is asked again.
+
+        :param observation: (B, O)
+        :param timestep: (B,)
+        :return: None where nothing of B environments is remembered
+        """
+        before, after = self._before, self._after
+        if before is None or after is None or len(after.mask) != len(observation):
+            return None
+        same_step = timestep == after.timesteps[:, -1]
+        again = same_step & (observation == after.observations[:, -1]).all(axis=1)
+        if (same_step & ~again).any():
+            self.warn(f"Time step {timestep[same_step & ~again][0]} came twice in turn, with two different observations.")
+        if not again.any():
+            return after
+        return before if again.all() else _choose(again, before, after)
+
+    def remember(self, before: Context, after: Context) -> None:
+        """
+        :param before: what :meth:`recall` gave, or an empty context
+        :param after: with the newest step and its action
+        """
+        self._before, self._after = before, after
+
+    def warn(self, what: str) -> None:
+        """Tell once how contexts are kept apart."""
+        if not self._has_warned:
+            self._has_warned = True
+            warnings.warn(f"{what} {ADVICE}", UserWarning, stacklevel=4)
+
+
+def _choose(rows: np.ndarray, first: Context, second: Context) -> Context:
+    """The rows of the first context where `rows` (B,) is True, of the second elsewhere."""
+    chosen = {}
+    for name, ours, theirs in zip(Context._fields, first, second, strict=True):
+        if ours.shape != theirs.shape:  # one of them keeps nothing: both are computed from their windows
+            ours = theirs = np.zeros((len(rows), 0), np.float32)
+        chosen[name] = np.where(rows.reshape(-1, *[1] * (ours.ndim - 1)), ours, theirs)
+    return Context(**chosen)

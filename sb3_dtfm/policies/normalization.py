@@ -1,0 +1,82 @@
+"""The units of a network: windows and actions between the environment's and its own."""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from torch import nn
+
+from sb3_dtfm.windows import Windows
+
+# Observations are clipped at this many standard deviations, as SB3's VecNormalize does.
+OBSERVATION_CLIP = 10.0
+# A dimension whose standard deviation is smaller is a constant, and becomes zero.
+SMALLEST_STD = 1e-6
+
+
+class Normalization(nn.Module):
+    """
+    What inputs are normalised by, measured on the training data and saved with the weights; and the range of actions.
+
+    :param observation_dim: O
+    :param action_space: bounded Box (A,)
+    :param max_timestep: time steps with a range of return-to-go of their own
+    :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step
+    """
+
+    observation_mean: th.Tensor
+    observation_std: th.Tensor
+    return_scale: th.Tensor
+    return_to_go_range: th.Tensor | None
+    action_low: th.Tensor
+    action_high: th.Tensor
+
+    def __init__(self, observation_dim: int, action_space: spaces.Box, max_timestep: int, clip_return_to_go: bool) -> None:
+        super().__init__()
+        self.max_timestep = max_timestep
+        self.register_buffer("observation_mean", th.zeros(observation_dim))
+        self.register_buffer("observation_std", th.ones(observation_dim))
+        self.register_buffer("return_scale", th.ones(()))
+        unlimited = th.tensor([[-th.inf], [th.inf]]).repeat(1, max_timestep) if clip_return_to_go else None
+        self.register_buffer("return_to_go_range", unlimited)
+        for name, bound in (("action_low", action_space.low), ("action_high", action_space.high)):
+            self.register_buffer(name, th.as_tensor(bound, dtype=th.float32), persistent=False)
+
+    def set_statistics(self, observation_mean: np.ndarray, observation_std: np.ndarray, return_scale: float) -> None:
+        """
+        Take the input normalisation from training data.
+
+        :param observation_mean: (O,)
+        :param observation_std: (O,)
+        :param return_scale: largest absolute return-to-go, environment reward units
+        """
+        self.observation_mean.copy_(th.from_numpy(observation_mean))
+        self.observation_std.copy_(th.from_numpy(np.where(observation_std > SMALLEST_STD, observation_std, 1.0)))
+        self.return_scale.fill_(return_scale if return_scale > 0 else 1.0)
+
+    def set_return_to_go_range(self, limits: th.Tensor) -> None:
+        """
+        :param limits: (2, max_timestep), smallest and largest return-to-go by time step, environment reward units
+        """
+        assert self.return_to_go_range is not None
+        self.return_to_go_range.copy_(limits)
+
+    def forward(self, windows: Windows) -> Windows:
+        """
+        :param windows: tensors; observations and returns-to-go as the environment gives them
+        :return: observations normalised and clipped, returns-to-go scaled, the others as they are
+        """
+        observations = (windows.observations - self.observation_mean) / self.observation_std
+        returns_to_go = windows.returns_to_go
+        if self.return_to_go_range is not None:
+            low, high = self.return_to_go_range[:, windows.timesteps.clamp(max=self.max_timestep - 1)]
+            returns_to_go = returns_to_go.clamp(low, high)
+        return windows._replace(
+            observations=observations.clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP),
+            returns_to_go=returns_to_go / self.return_scale,
+        )
+
+    def scale_action(self, action: Any) -> Any:
+        """From the environment's range to [-1, 1], (..., A)."""
+        return 2.0 * (action - self.action_low) / (self.action_high - self.action_low) - 1.0

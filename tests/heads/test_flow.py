@@ -1,0 +1,109 @@
+"""The flow's mathematics against closed forms, and what the head makes of it."""
+
+import pytest
+import torch as th
+from torch import nn
+
+from sb3_dtfm.heads import FlowHead, RegressionHead
+from sb3_dtfm.heads.flow import interpolate
+from sb3_dtfm.networks.solvers import SOLVERS
+
+PREDICTIONS = ("velocity", "action")
+
+
+def test_interpolate_runs_from_noise_at_zero_to_action_at_one():
+    noise, action = th.randn(4, 3), th.randn(4, 3)
+    for tau, expected in ((0.0, noise), (1.0, action), (0.25, 0.75 * noise + 0.25 * action)):
+        x, velocity = interpolate(noise, action, th.full((4, 1), tau))
+        assert th.allclose(x, expected, atol=1e-6)
+        assert th.allclose(velocity, action - noise)
+
+
+def test_velocity_agrees_with_the_papers_form_away_from_its_singularity():
+    noise, action, tau = th.randn(4, 3), th.randn(4, 3), th.full((4, 1), 0.7)
+    x, velocity = interpolate(noise, action, tau)
+    assert th.allclose(velocity, (action - x) / (1 - tau), atol=1e-5)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("n_solver_steps", [1, 7])
+def test_a_predicted_action_is_where_every_solver_ends(solver, n_solver_steps):
+    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_prediction="action")
+    action = th.tensor([0.3, -0.8])
+    with th.no_grad():
+        head.regression.weight.zero_()
+        head.regression.bias.copy_(action.atanh())
+        th.testing.assert_close(head.solve(th.randn(5, 4), th.randn(5, 2), solver, n_solver_steps), action.expand(5, 2))
+
+
+@pytest.mark.parametrize("prediction", PREDICTIONS)
+def test_the_loss_is_the_mean_over_valid_steps(prediction):
+    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_prediction=prediction)
+    nn.init.normal_(head.vector_field.output.weight)
+    hidden, actions = th.randn(3, 5, 4), th.rand(3, 5, 2)
+    noise, tau = th.randn(3, 5, 2), th.rand(3, 5)
+    mask = th.tensor([[0, 0, 1, 1, 1], [1, 1, 1, 1, 1], [0, 1, 1, 1, 1]], dtype=th.bool)
+    by_hand = []
+    for row, step in mask.nonzero().tolist():
+        x = (1 - tau[row, step]) * noise[row, step] + tau[row, step] * actions[row, step]
+        film = head.vector_field.film_condition(hidden[row, step]) + head.vector_field.time_share(tau[row, step])
+        output = head.vector_field(x, film)
+        if prediction == "velocity":
+            error = output - (actions[row, step] - noise[row, step])
+        else:
+            error = (head.regression(hidden[row, step]) + output).tanh() - actions[row, step]
+        by_hand.append(error.square().mean())
+    th.testing.assert_close(head.flow_loss(hidden, actions, mask, noise, tau), th.stack(by_hand).mean())
+
+
+@pytest.mark.parametrize("n_solver_steps", [1, 3, 50])
+def test_a_predicted_action_stays_within_the_bounds(n_solver_steps):
+    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_prediction="action")
+    with th.no_grad():
+        head.regression.weight.mul_(1000.0)
+        actions = head.solve(10 * th.randn(500, 4), th.randn(500, 2), "euler", n_solver_steps)
+    assert 0.9 < actions.abs().max() < 1.0 + 1e-6
+
+
+def test_a_head_that_predicts_actions_starts_as_decision_transformers():
+    head, regression = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_prediction="action"), RegressionHead(4, 2)
+    regression.linear.load_state_dict(head.regression.state_dict())
+    hidden, actions, mask = th.randn(3, 5, 4), th.rand(3, 5, 2), th.ones(3, 5, dtype=th.bool)
+    noise, tau = th.randn(3, 5, 2), th.rand(3, 5)
+    expected, _ = regression.loss(hidden, actions, mask)
+    th.testing.assert_close(head.flow_loss(hidden, actions, mask, noise, tau), expected)
+    th.testing.assert_close(head.solve(hidden, noise, "euler", 3), regression(hidden))
+
+
+def test_parts_of_the_loss_add_up():
+    """Flow, auxiliary regression by its weight, and the one-step network."""
+    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, regression_coef=0.5)
+    hidden, actions, mask = th.randn(3, 5, 4), th.rand(3, 5, 2), th.ones(3, 5, dtype=th.bool)
+    loss, parts = head.loss(hidden, actions, mask, th.randn(3, 5, 2), th.rand(3, 5))
+    assert set(parts) == {"flow_loss", "regression_loss", "one_step_loss"}
+    th.testing.assert_close(loss, parts["flow_loss"] + 0.5 * parts["regression_loss"] + parts["one_step_loss"])
+
+
+@pytest.mark.parametrize("prediction", PREDICTIONS)
+def test_a_flow_head_learns_two_modes_that_regression_would_average(prediction):
+    th.manual_seed(0)
+    generator = th.Generator().manual_seed(0)
+    head = FlowHead(embed_dim=4, action_dim=1, flow_hidden_dim=64, flow_n_layers=2, flow_prediction=prediction)
+    optimizer = th.optim.Adam(head.parameters(), 3e-3)
+    hidden, mask = th.zeros(256, 1, 4), th.ones(256, 1, dtype=th.bool)
+    for _ in range(400):
+        actions = th.where(th.rand(256, 1, 1, generator=generator) < 0.5, -0.7, 0.7)
+        noise, tau = th.randn(256, 1, 1, generator=generator), th.rand(256, 1, generator=generator)
+        optimizer.zero_grad()
+        head.loss(hidden, actions, mask, noise, tau)[0].backward()
+        optimizer.step()
+    with th.no_grad():
+        samples = head.solve(th.zeros(500, 4), th.randn(500, 1, generator=generator), "euler", 20)
+        noise = th.randn(500, 1, generator=generator)
+        ends, plain = (head.solve(th.zeros(500, 4), noise, "euler", n_steps) for n_steps in (16, 1))
+        jumps = head.jump(th.zeros(500, 4), noise)
+    assert ((samples.abs() - 0.7).abs() < 0.2).float().mean() > 0.9
+    assert 0.35 < (samples > 0).float().mean() < 0.65
+    far = noise.abs() > 0.3  # between the modes the flow is steep
+    assert (jumps - ends)[far].abs().mean() < 0.1
+    assert (plain - ends)[far].abs().mean() > 0.4
