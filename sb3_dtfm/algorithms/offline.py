@@ -30,6 +30,7 @@ from sb3_dtfm.distributed import (
 from sb3_dtfm.envs import check_vec_env, return_to_go_space
 from sb3_dtfm.optimization import LEARNING_RATE_SCHEDULES, PRECISIONS, RunningMeans, autocast, learning_rate_factor
 from sb3_dtfm.policies import SequencePolicy
+from sb3_dtfm.windows import Windows
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineSequenceAlgorithm")
 Dataset: TypeAlias = str | PathLike[str] | minari.MinariDataset | TrajectoryBuffer
@@ -294,11 +295,11 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         parallel = DataParallel(self.policy, self._loss_function(), self.batch_size)
         generator = self._training_generator(parallel)
         callback.on_training_start(locals(), globals())
-        ends = buffer.draw(self.batch_size, generator, self.timestep_exponent)
+        batches = buffer.batches(self.batch_size, self.context_length, generator, self.timestep_exponent)
         while self.num_timesteps < total_timesteps:
             step_start = time.perf_counter()
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
-            ends = self._gradient_step(buffer, ends, generator, parallel)
+            self._gradient_step(next(batches), generator, parallel)
             self.num_timesteps += 1
             self._training_seconds += time.perf_counter() - step_start
             if log_interval and (self.num_timesteps % log_interval == 0 or self.num_timesteps == total_timesteps):
@@ -316,21 +317,12 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         compute_loss = th.compile(self.policy.compute_loss) if compile_it else self.policy.compute_loss
         return autocast(self.precision, self.device)(compute_loss)
 
-    def _gradient_step(
-        self, buffer: TrajectoryBuffer, ends: th.Tensor, generator: th.Generator, parallel: DataParallel
-    ) -> th.Tensor:
-        """
-        Learn from the windows that end at `ends`.
-
-        :return: the ends of the next batch, whose windows are read from disk meanwhile where the buffer is a cache
-        """
+    def _gradient_step(self, batch: Windows, generator: th.Generator, parallel: DataParallel) -> None:
+        """Learn from a batch."""
         self.policy.set_training_mode(True)  # an evaluation in between leaves evaluation mode on
         self._update_learning_rate(self.policy.optimizer)
         self.policy.optimizer.zero_grad(set_to_none=True)  # before the loss, which has the most in memory
-        batch = buffer.windows(ends, self.context_length)
         loss, parts = parallel.compute_loss(batch, *self.policy.draw_noise(batch, generator))
-        next_ends = buffer.draw(self.batch_size, generator, self.timestep_exponent)
-        buffer.prefetch(next_ends, self.context_length)
         loss.backward()
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.clipped_parameters(), self.max_grad_norm or math.inf)
         self.policy.optimizer.step()
@@ -339,7 +331,6 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
             # A young average follows more closely, or the random start would stay in it for long.
             self.policy.update_ema(min(self.ema_decay, (1 + self._n_updates) / (10 + self._n_updates)))
         self._means.add(parallel.mean({"loss": loss, "grad_norm": grad_norm, **parts}))
-        return next_ends
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         remaining = self._current_progress_remaining

@@ -1,0 +1,97 @@
+"""The table of readers, and one function that finds the right one for a dataset."""
+
+import copy
+import inspect
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from minari import MinariDataset
+
+from sb3_dtfm.data.buffer import TrajectoryBuffer
+from sb3_dtfm.data.cache import Fingerprint, load_cached
+from sb3_dtfm.data.minari import fingerprint_minari, is_minari, load_minari
+from sb3_dtfm.data.robomimic import fingerprint_robomimic, is_robomimic, load_robomimic
+from sb3_dtfm.data.trajectories import DatasetError
+
+
+class Reader(NamedTuple):
+    """
+    How datasets of one kind are read.
+
+    :param kind: what they are, for messages
+    :param accepts: whether something is one of them
+    :param load: reads one; its other parameters are the options that users have, and `storage`, where the steps go
+    :param fingerprint: what a cache of one is known by, given the dataset and the options for `load`
+    """
+
+    kind: str
+    accepts: Callable[[Any], bool]
+    load: Callable[..., TrajectoryBuffer]
+    fingerprint: Callable[[Any, dict[str, Any]], Fingerprint]
+
+
+# The first one that accepts a dataset reads it.
+READERS = (
+    Reader("the path of a robomimic file (.hdf5)", is_robomimic, load_robomimic, fingerprint_robomimic),
+    Reader("a Minari id (namespace/name-vN) or MinariDataset", is_minari, load_minari, fingerprint_minari),
+)
+
+
+def load_dataset(
+    dataset: str | os.PathLike[str] | MinariDataset | TrajectoryBuffer,
+    cache_dir: str | os.PathLike[str] | None = None,
+    env_id: str | None = None,
+    **kwargs: Any,
+) -> TrajectoryBuffer:
+    """
+    Read recorded episodes from wherever they are.
+
+    :param dataset: a Minari id (`namespace/name-vN`), an opened Minari dataset, the path of a robomimic hdf5 file, or a
+        buffer, which is returned as it is
+    :param cache_dir: learn from memory-mapped files in this folder, for datasets larger than memory; they are written at
+        the first call and whenever the dataset has changed. None reads everything into memory
+    :param env_id: Gymnasium id of the environment that the episodes count as coming from, whatever the dataset says
+    :param kwargs: options of the reader (`filter_key` and `observation_keys` for robomimic files)
+    :raises DatasetError: `dataset` is nothing of the above, its reader refuses it, or its cache cannot be used
+    :raises TypeError: the reader has no such option
+    """
+    buffer = _load(dataset, cache_dir, kwargs)
+    if env_id is None:
+        return buffer
+    buffer = copy.copy(buffer)
+    buffer.env_id = env_id
+    return buffer
+
+
+def _load(dataset: Any, cache_dir: str | os.PathLike[str] | None, options: dict[str, Any]) -> TrajectoryBuffer:
+    if isinstance(dataset, TrajectoryBuffer):
+        given = options if cache_dir is None else {"cache_dir": cache_dir, **options}
+        _check_options(dataset.source, given, ["env_id"])
+        return dataset
+    reader = _find_reader(dataset)
+    own = [name for name in inspect.signature(reader.load).parameters if name != "storage"][1:]
+    _check_options(dataset, options, [*own, "cache_dir", "env_id"])
+    if cache_dir is None:
+        return reader.load(dataset, **options)
+    return load_cached(
+        Path(cache_dir).expanduser(),
+        reader.fingerprint(dataset, options),
+        lambda storage: reader.load(dataset, storage=storage, **options),
+    )
+
+
+def _find_reader(dataset: Any) -> Reader:
+    for reader in READERS:
+        if reader.accepts(dataset):
+            return reader
+    found = f"{dataset!r}" if isinstance(dataset, str) else f"a {type(dataset).__name__}"
+    kinds = ", ".join(reader.kind for reader in READERS)
+    raise DatasetError(f"dataset is {found}; accepted are {kinds}, or a TrajectoryBuffer.")
+
+
+def _check_options(dataset: Any, given: dict[str, Any], accepted: list[str]) -> None:
+    unknown = sorted(set(given) - set(accepted))
+    if unknown:
+        raise TypeError(f"dataset {dataset!s}: unknown option {', '.join(unknown)}; accepted: {', '.join(accepted)}.")
