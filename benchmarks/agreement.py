@@ -37,7 +37,7 @@ def window_ends(buffer: TrajectoryBuffer) -> dict[str, th.Tensor]:
     generator = th.Generator().manual_seed(0)
     first = th.nonzero(buffer.timesteps < N_FIRST_STEPS).squeeze(1)
     return {
-        "anywhere": buffer.draw(N_WINDOWS, generator),
+        "anywhere": th.randint(len(buffer), (N_WINDOWS,), generator=generator),
         f"first {N_FIRST_STEPS} steps": first[th.randint(len(first), (N_WINDOWS,), generator=generator)],
     }
 

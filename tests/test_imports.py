@@ -21,7 +21,7 @@ ROOMS = {
     "distributed": ("sb3_dtfm/distributed.py", set()),
     "algorithms": (
         "sb3_dtfm/algorithms",
-        {"algorithms", "policies", "data", "envs", "callbacks", "optimization", "distributed"},
+        {"algorithms", "policies", "data", "envs", "callbacks", "optimization", "distributed", "windows"},
     ),
     "zoo": ("sb3_dtfm/zoo", {"", "data", "envs", "distributed", "zoo"}),
     "benchmark": ("sb3_dtfm/benchmark", {"", "data", "zoo", "benchmark", "cli"}),

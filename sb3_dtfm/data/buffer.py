@@ -1,7 +1,8 @@
 """All recorded episodes flat in a `TrajectoryBuffer`, sampled in windows."""
 
 import copy
-from collections.abc import Iterable, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 import torch as th
@@ -9,7 +10,15 @@ from gymnasium import spaces
 
 from sb3_dtfm.data.episodes import EpisodeTable, Statistics, moments
 from sb3_dtfm.data.storage import STEP_ARRAYS, FileStorage, MappedSteps, MemoryStorage
-from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, check_trajectory, returns_to_go
+from sb3_dtfm.data.trajectories import (
+    DatasetError,
+    ScoreReference,
+    Trajectory,
+    check_action_space,
+    check_observation_space,
+    check_trajectory,
+    returns_to_go,
+)
 from sb3_dtfm.windows import Windows
 
 # A buffer moves to an accelerator if it takes at most this share of the memory that is free there.
@@ -28,6 +37,7 @@ class TrajectoryBuffer:
     :ivar rewards: (N,) float32, environment reward units
     :ivar returns_to_go: (N,) float32, environment reward units
     :ivar episodes: the buffer's episodes, one row each
+    :ivar env_id: Gymnasium id of the environment that they come from, None where nobody says
     :ivar device: what batches are made for
     """
 
@@ -39,6 +49,7 @@ class TrajectoryBuffer:
         action_space: spaces.Box,
         source: str,
         score_reference: ScoreReference | None = None,
+        env_id: str | None = None,
         maps: Sequence[MappedSteps] = (),
     ) -> None:
         self.observations = tensors["observations"]
@@ -49,6 +60,7 @@ class TrajectoryBuffer:
         self.action_space = action_space
         self.source = source
         self.score_reference = score_reference
+        self.env_id = env_id
         self._maps = maps
         self.device = self.observations.device
         self._set_episodes(episodes)
@@ -71,20 +83,24 @@ class TrajectoryBuffer:
         n_steps: int | None = None,
         source: str = "trajectories",
         score_reference: ScoreReference | None = None,
+        env_id: str | None = None,
         storage: MemoryStorage | FileStorage | None = None,
     ) -> "TrajectoryBuffer":
         """
         Copy episodes into flat arrays, checking every number on the way.
 
         :param trajectories: the episodes, at least one, each of at least one step; an iterator is read once
-        :param action_space: bounded Box of shape (A,)
+        :param action_space: bounded Box of floats of shape (A,)
         :param observation_space: Box of shape (O,); unbounded with the first episode's O if not given
         :param n_steps: steps of all episodes, where known beforehand, so that memory for them is taken once
         :param source: where the episodes come from, for messages
         :param score_reference: scale of the normalised score
+        :param env_id: Gymnasium id of the environment that the episodes come from
         :param storage: where the steps go, memory if not given
-        :raises DatasetError: nothing to learn from, wrong shapes, NaN or infinity, or actions outside of `action_space`
+        :raises DatasetError: nothing to learn from, other spaces, wrong shapes, NaN or infinity, or actions outside of
+            `action_space`
         """
+        action_space = check_action_space(action_space, source)
         storage = storage or MemoryStorage()
         if n_steps is None and isinstance(trajectories, Sequence):
             n_steps = sum(map(len, trajectories))
@@ -94,6 +110,7 @@ class TrajectoryBuffer:
         for trajectory in trajectories:
             if observation_space is None:
                 observation_space = spaces.Box(-np.inf, np.inf, np.shape(trajectory.observations)[1:], np.float32)
+            check_observation_space(observation_space, source)
             check_trajectory(trajectory, observation_space, action_space, source)
             to_go = returns_to_go(trajectory.rewards)
             storage.append(
@@ -115,6 +132,7 @@ class TrajectoryBuffer:
             action_space,
             source,
             score_reference,
+            env_id,
         )
 
     def __len__(self) -> int:
@@ -222,43 +240,56 @@ class TrajectoryBuffer:
         moved._set_episodes(self.episodes)
         return moved
 
+    def batches(
+        self, batch_size: int, context_length: int, generator: th.Generator, timestep_exponent: float = 1.0
+    ) -> Iterator[Windows]:
+        """
+        Endless batches of windows, each drawn before the one before it is handed out.
+
+        So the windows of a cache are on their way from the disk while the caller is busy with the batch before.
+
+        :param batch_size: B
+        :param context_length: K
+        :param generator: source of randomness, of nothing else: it is a batch ahead
+        :param timestep_exponent: e of the time step T u^e in an episode of T steps, for u uniform in [0, 1]; 1 draws any
+            step of any episode with equal probability
+        """
+
+        def ends() -> Iterator[th.Tensor]:
+            while True:
+                drawn = self._draw(batch_size, generator, timestep_exponent)
+                self._prefetch(drawn, context_length)
+                yield drawn
+
+        for present, _ in itertools.pairwise(ends()):
+            yield self.windows(present, context_length)
+
     def sample(self, batch_size: int, context_length: int, generator: th.Generator | None = None) -> Windows:
         """
         Windows that end at any step of any episode with equal probability.
 
         :param batch_size: B
         :param context_length: K
-        :param generator: source of randomness, on the buffer's device
+        :param generator: source of randomness
         """
-        return self.windows(self.draw(batch_size, generator), context_length)
+        return self.windows(self._draw(batch_size, generator), context_length)
 
-    def draw(self, batch_size: int, generator: th.Generator | None = None, timestep_exponent: float = 1.0) -> th.Tensor:
-        """
-        The random part of :meth:`sample`: what to give to :meth:`windows`.
-
-        :param batch_size: B
-        :param generator: source of randomness, on the buffer's device
-        :param timestep_exponent: e of the time step T u^e in an episode of T steps, for u uniform in [0, 1]
-        :return: (B,) int64 positions among the buffer's own steps
-        """
-        positions = th.randint(len(self), (batch_size,), generator=generator, device=self.device)
+    def _draw(self, batch_size: int, generator: th.Generator | None, timestep_exponent: float = 1.0) -> th.Tensor:
+        """Ends of windows as for :meth:`windows`, drawn where the generator is; see :meth:`batches`."""
+        device = self.device if generator is None else generator.device
+        positions = th.randint(len(self), (batch_size,), generator=generator, device=device).to(self._stops.device)
         if timestep_exponent == 1.0:
             return positions
-        u = th.rand(batch_size, generator=generator, device=self.device).to(self._stops.device)
-        episodes = th.searchsorted(self._stops, positions.to(self._stops.device), right=True)
+        u = th.rand(batch_size, generator=generator, device=device).to(self._stops.device)
+        episodes = th.searchsorted(self._stops, positions, right=True)
         firsts, lasts = self._firsts[episodes], self._stops[episodes] - 1
         timesteps = ((lasts + 1 - firsts) * u**timestep_exponent).long()
-        return th.minimum(firsts + timesteps, lasts).to(self.device)  # a product may round to T
+        return th.minimum(firsts + timesteps, lasts)  # a product may round to T
 
-    def prefetch(self, ends: th.Tensor, context_length: int) -> None:
-        """
-        Start to read windows from disk, if that is where they are, so that :meth:`windows` need not wait for them.
-
-        :param ends: (B,) as for :meth:`windows`
-        :param context_length: K
-        """
+    def _prefetch(self, ends: th.Tensor, context_length: int) -> None:
+        """Start to read windows from disk, if that is where they are, so that :meth:`windows` need not wait for them."""
         if self.memory_mapped:
-            stops = (self._locate(ends.to(self._stops.device))[0] + 1).tolist()
+            stops = (self._locate(ends)[0] + 1).tolist()
             for steps in self._maps:
                 steps.will_need(stops, context_length)
 

@@ -6,7 +6,7 @@ import json
 import re
 import shutil
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,9 +21,10 @@ from sb3_dtfm.data.storage import STEP_ARRAYS, FileStorage, MappedSteps
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference
 
 # Counts up whenever what is stored, or what the readers make of a dataset, changes: older caches are then built anew.
-FORMAT = 1
+FORMAT = 2
 DESCRIPTION = "cache.json"
 EPISODES = "episodes.npz"
+BOXES = ("observation_space", "action_space")
 # What numpy raises for a file that is missing, empty, cut off, or of another kind.
 READ_ERRORS = (OSError, EOFError, LookupError, TypeError, ValueError, zipfile.BadZipFile)
 
@@ -32,31 +33,35 @@ class Fingerprint(NamedTuple):
     """
     What a cache was made from.
 
-    :param path: the dataset's file or folder
+    :param name: what the dataset is called
+    :param path: its file or folder
     :param arguments: what was read of it
     :param state: digest of names, sizes and modification times of its files
     """
 
+    name: str
     path: str
     arguments: str
     state: str
 
     @classmethod
-    def of(cls, path: Path, arguments: Any) -> "Fingerprint":
+    def of(cls, name: str, path: Path, arguments: Any) -> "Fingerprint":
         """
         That of a dataset as it is now.
 
+        :param name: what it is called, for its cache's folder and messages
         :param path: its file, or the folder that holds its files
         :param arguments: of the reader, as JSON can hold them
         """
         path = path.resolve()
         files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
         state = [(str(file.relative_to(path)), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
-        return cls(str(path), json.dumps(arguments, sort_keys=True), _digest(state))
+        return cls(name, str(path), json.dumps(arguments, sort_keys=True), _digest(state))
 
-    def folder_name(self, source: str) -> str:
+    @property
+    def folder_name(self) -> str:
         """One for each dataset and choice from it, so that a changed dataset takes the place of the old one."""
-        name = re.sub(r"[^\w.-]+", "-", source)
+        name = re.sub(r"[^\w.-]+", "-", self.name)
         return f"{name}-{_digest([self.path, self.arguments])[:16]}"
 
 
@@ -65,7 +70,7 @@ def _digest(value: Any) -> str:
 
 
 def load_cached(
-    cache_dir: Path, fingerprint: Fingerprint, source: str, read: Callable[[FileStorage], TrajectoryBuffer]
+    cache_dir: Path, fingerprint: Fingerprint, read: Callable[[FileStorage], TrajectoryBuffer]
 ) -> TrajectoryBuffer:
     """
     Open a dataset's cache, which is built first if there is none or the dataset has changed since.
@@ -74,18 +79,17 @@ def load_cached(
 
     :param cache_dir: folder of caches, made if necessary
     :param fingerprint: of the dataset as it is now
-    :param source: name of the dataset, for the progress bar
     :param read: fills the storage that it is given
     :raises DatasetError: the dataset cannot be read, or the cache cannot be written or is damaged
     """
-    folder = cache_dir / fingerprint.folder_name(source)
+    folder = cache_dir / fingerprint.folder_name
     try:
         cache_dir.mkdir(parents=True, exist_ok=True)
         with FileLock(cache_dir / f".{folder.name}.lock"):
             if not _is_current(folder, fingerprint):
-                _build(folder, fingerprint, source, read)
+                _build(folder, fingerprint, read)
     except OSError as error:
-        raise DatasetError(f"cache {folder} of {source} cannot be written: {error}") from error
+        raise DatasetError(f"cache {folder} of {fingerprint.name} cannot be written: {error}") from error
     return open_cache(folder)
 
 
@@ -96,20 +100,21 @@ def _is_current(folder: Path, fingerprint: Fingerprint) -> bool:
     return description.get("format") == FORMAT and description.get("fingerprint") == fingerprint._asdict()
 
 
-def _build(folder: Path, fingerprint: Fingerprint, source: str, read: Callable[[FileStorage], TrajectoryBuffer]) -> None:
+def _build(folder: Path, fingerprint: Fingerprint, read: Callable[[FileStorage], TrajectoryBuffer]) -> None:
     part = folder.with_name(f".{folder.name}.part")
     for old in (part, folder):  # what a killed build left, and an outdated cache, whose room may be needed
         if old.exists():
             shutil.rmtree(old)
     part.mkdir()
     try:
-        with contextlib.closing(FileStorage(part, f"Caching {source}")) as storage:
+        with contextlib.closing(FileStorage(part, f"Caching {fingerprint.name}")) as storage:
             buffer = read(storage)
         _write_episodes(part, buffer)
         description = {
             "format": FORMAT,
             "fingerprint": fingerprint._asdict(),
             "source": buffer.source,
+            "env_id": buffer.env_id,
             "score_reference": buffer.score_reference,
             "n_steps": len(buffer),
         }
@@ -122,9 +127,13 @@ def _build(folder: Path, fingerprint: Fingerprint, source: str, read: Callable[[
 
 def _write_episodes(folder: Path, buffer: TrajectoryBuffer) -> None:
     """The arrays that are small: one row per episode, and the bounds of the spaces."""
-    boxes = {"observation": buffer.observation_space, "action": buffer.action_space}
-    bounds = {f"{name}_{bound}": getattr(box, bound) for name, box in boxes.items() for bound in ("low", "high")}
+    bounds = {f"{name}_{bound}": getattr(getattr(buffer, name), bound) for name in BOXES for bound in ("low", "high")}
     np.savez(folder / EPISODES, **buffer.episodes._asdict(), **bounds)
+
+
+def _stored_box(arrays: Mapping[str, np.ndarray], name: str) -> spaces.Box:
+    low, high = arrays[f"{name}_low"], arrays[f"{name}_high"]
+    return spaces.Box(low, high, dtype=low.dtype.type)
 
 
 def _read_description(folder: Path) -> dict[str, Any]:
@@ -152,8 +161,7 @@ def open_cache(folder: Path) -> TrajectoryBuffer:
     try:
         with np.load(folder / EPISODES) as arrays:
             episodes = EpisodeTable(*(arrays[name] for name in EpisodeTable._fields))
-            action_space = spaces.Box(arrays["action_low"], arrays["action_high"], dtype=np.float32)
-            observation_space = spaces.Box(arrays["observation_low"], arrays["observation_high"], dtype=np.float32)
+            observation_space, action_space = (_stored_box(arrays, name) for name in BOXES)
     except READ_ERRORS as error:
         raise _damaged(folder, EPISODES, error) from error
     shapes: dict[str, tuple[int, ...]] = {"observations": observation_space.shape, "actions": action_space.shape}
@@ -167,6 +175,7 @@ def open_cache(folder: Path) -> TrajectoryBuffer:
         action_space,
         f"{description['source']}, cached in {folder}",
         None if reference is None else ScoreReference(*reference),
+        description["env_id"],
         maps=[steps for name, steps in maps.items() if name != "rewards"],  # which windows do not hold
     )
 

@@ -14,6 +14,7 @@ from minari.dataset.minari_dataset import parse_dataset_id
 from minari.storage import get_dataset_path
 
 from sb3_dtfm.data.buffer import TrajectoryBuffer
+from sb3_dtfm.data.cache import Fingerprint
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory
 from sb3_dtfm.envs.return_to_go import flatten_observation_space, sort_observation_space
@@ -22,6 +23,29 @@ HDF5_FILE_NAME = "main_data.hdf5"
 # Bytes that HDF5 may keep of a file's structure; its own limit is a third of a usual dataset's size.
 STRUCTURE_CACHE = 2**20
 EPISODE_KEYS = ("observations", "actions", "rewards", "terminations", "truncations")
+
+
+def is_minari(dataset: Any) -> bool:
+    """Whether this is an opened Minari dataset or an id of one."""
+    if not isinstance(dataset, str):
+        return isinstance(dataset, minari.MinariDataset)
+    try:
+        parse_dataset_id(dataset)
+    except (ValueError, TypeError):
+        return False
+    return True
+
+
+def fingerprint_minari(dataset: str | minari.MinariDataset, options: dict[str, Any]) -> Fingerprint:
+    """
+    Of a dataset as it is now, downloaded if necessary, and of its choice of episodes.
+
+    :param dataset: as for :func:`load_minari`, which has no options
+    """
+    dataset = open_minari(dataset) if isinstance(dataset, str) else dataset
+    episodes = dataset.episode_indices.tolist()
+    is_whole = episodes == list(range(dataset.storage.total_episodes))
+    return Fingerprint.of(dataset.id, Path(dataset.storage.data_path), "all" if is_whole else episodes)
 
 
 def load_minari(dataset: str | minari.MinariDataset, storage: FileStorage | None = None) -> TrajectoryBuffer:
@@ -40,7 +64,6 @@ def load_minari(dataset: str | minari.MinariDataset, storage: FileStorage | None
     source = f"Minari dataset {dataset.id} ({hdf5_file if in_hdf5 else hdf5_file.parent})"
     if len(dataset.episode_indices) == 0:
         raise DatasetError(f"{source}: holds no episode; at least one is needed.")
-    action_space = check_action_space(dataset.action_space, source)
     try:
         observation_space = flatten_observation_space(dataset.observation_space)
     except ValueError as error:
@@ -48,11 +71,12 @@ def load_minari(dataset: str | minari.MinariDataset, storage: FileStorage | None
     try:
         return TrajectoryBuffer.from_trajectories(
             _read_hdf5(dataset, source, hdf5_file) if in_hdf5 else _read_storage(dataset, source),
-            action_space,
+            dataset.action_space,
             observation_space,
             n_steps=dataset.total_steps,
             source=source,
             score_reference=score_reference(dataset),
+            env_id=dataset.env_spec.id if dataset.env_spec else None,
             storage=storage,
         )
     except (OSError, LookupError, RuntimeError) as error:
@@ -66,10 +90,8 @@ def open_minari(dataset_id: str) -> minari.MinariDataset:
     :param dataset_id: `namespace/name-vN`
     :raises DatasetError: malformed id, damaged local files, or neither found nor downloaded
     """
-    try:
-        parse_dataset_id(dataset_id)
-    except (ValueError, TypeError) as error:
-        raise DatasetError(f"{dataset_id!r} is no Minari id; expected namespace/name-vN.") from error
+    if not is_minari(dataset_id):
+        raise DatasetError(f"{dataset_id!r} is no Minari id; expected namespace/name-vN.")
     data_path = get_dataset_path(dataset_id) / "data"
     if not data_path.exists():
         _download(dataset_id)
@@ -90,17 +112,6 @@ def _download(dataset_id: str) -> None:
             f"Minari dataset {dataset_id} is not in {get_dataset_path()} (set by MINARI_DATASETS_PATH), which holds "
             f"{', '.join(local) if local else 'no dataset'}; and it cannot be downloaded: {error}"
         ) from error
-
-
-def check_action_space(space: spaces.Space, source: str) -> spaces.Box:
-    """
-    The action space, if actions from it can be learnt.
-
-    :raises DatasetError: not a bounded Box of shape (A,)
-    """
-    if not isinstance(space, spaces.Box) or len(space.shape) != 1 or not space.is_bounded():
-        raise DatasetError(f"{source}: the action space is {space}; only a bounded Box of shape (A,) can be learnt.")
-    return space
 
 
 def score_reference(dataset: minari.MinariDataset) -> ScoreReference | None:

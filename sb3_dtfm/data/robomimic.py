@@ -15,13 +15,36 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_dtfm.data.buffer import TrajectoryBuffer
+from sb3_dtfm.data.cache import Fingerprint
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory
+from sb3_dtfm.envs.robosuite_scene import TASKS
 
 DEFAULT_OBSERVATION_KEYS = ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos", "object")
+HDF5_SUFFIXES = (".hdf5", ".h5")
 ALIASES = {"object": "object-state", "object-state": "object"}  # robomimic's name and robosuite's
 VALIDATION_SHARE = 0.1
 OLD_LAYOUT_TOLERANCE = 1e-3  # metres
+
+
+def is_robomimic(dataset: Any) -> bool:
+    """Whether this is the path of a file: one that exists, or a name that nothing else would have."""
+    if not isinstance(dataset, str):
+        return isinstance(dataset, os.PathLike)
+    looks_like_a_path = dataset.startswith((".", "~", os.sep)) or dataset.endswith(HDF5_SUFFIXES)
+    return looks_like_a_path or os.path.isfile(dataset)
+
+
+def fingerprint_robomimic(path: str | os.PathLike[str], options: dict[str, Any]) -> Fingerprint:
+    """
+    Of a file as it is now.
+
+    :param path: the file
+    :param options: of :func:`load_robomimic`
+    :raises DatasetError: no such file
+    """
+    path = _existing_file(path)
+    return Fingerprint.of(path.name, path, options)
 
 
 def load_robomimic(
@@ -51,6 +74,7 @@ def load_robomimic(
     :raises DatasetError: no such file, not readable, nothing in it, unknown keys, wrong shapes, NaN or infinity, or actions
         out of range; names the file, the demonstration and the step
     """
+    path = _existing_file(path)
     source = str(path)
     try:
         with _open(source) as file:
@@ -59,9 +83,15 @@ def load_robomimic(
         raise DatasetError(f"{source}: cannot be read to the end ({error}); is the file cut off?") from error
 
 
+def _existing_file(path: str | os.PathLike[str]) -> Path:
+    path = Path(path).expanduser()
+    if not path.is_file():
+        problem = "is a folder" if path.is_dir() else "does not exist"
+        raise DatasetError(f"{path.absolute()} {problem}; the path of a robomimic hdf5 file is expected.")
+    return path
+
+
 def _open(source: str) -> h5py.File:
-    if not os.path.isfile(source):
-        raise DatasetError(f"{source}: no such file; the path of a robomimic hdf5 file is expected.")
     if not h5py.is_hdf5(source):
         raise DatasetError(f"{source}: not an hdf5 file; a robomimic hdf5 file is expected.")
     return h5py.File(source, "r")
@@ -103,6 +133,7 @@ def _read(
         action_space=_action_space(env_args, n_actions, source),
         n_steps=sum(len(rewards[name]) for name in demos),
         source=source,
+        env_id=_env_id(env_args),
         storage=storage,
     )
 
@@ -138,6 +169,13 @@ def _env_args(data: h5py.Group, source: str) -> dict[str, Any]:
     except (TypeError, ValueError) as error:
         raise DatasetError(f"{source}: attribute 'env_args' of group 'data' is not JSON ({error}).") from error
     return env_args if isinstance(env_args, dict) else {}
+
+
+def _env_id(env_args: dict[str, Any]) -> str | None:
+    """Gymnasium id of the file's environment, None where none is registered for it."""
+    tasks = {robosuite_name: task for task, robosuite_name in TASKS.items()}
+    name = env_args.get("env_name")
+    return f"robosuite/{tasks[name]}-v0" if name in tasks else None
 
 
 def _n_steps(demo: h5py.Group, where: str) -> int:

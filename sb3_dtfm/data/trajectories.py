@@ -66,6 +66,38 @@ def returns_to_go(rewards: np.ndarray) -> np.ndarray:
     return np.subtract.accumulate(np.concatenate([[rewards.sum()], rewards[:-1]]))
 
 
+def check_action_space(space: spaces.Space, source: str) -> spaces.Box:
+    """
+    The action space, if actions from it can be learnt: scaled to [-1, 1] and back in float32.
+
+    :param space: of a dataset or an environment
+    :param source: whose it is, for messages
+    :raises DatasetError: not a Box of floats of shape (A,), or a dimension without bounds or width
+    """
+    accepted = "only a bounded Box of floats of shape (A,), low < high in each dimension, can be learnt"
+    is_vector = isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating) and len(space.shape) == 1
+    if not is_vector or space.shape == (0,):
+        raise DatasetError(f"{source}: the action space is {space}; {accepted}.")
+    with np.errstate(over="ignore", invalid="ignore"):
+        widths = space.high.astype(np.float32) - space.low.astype(np.float32)
+    unfit = np.flatnonzero(~((widths > 0.0) & np.isfinite(widths)))
+    if len(unfit):
+        reach = f"from {space.low[unfit[0]]:g} to {space.high[unfit[0]]:g}"
+        raise DatasetError(f"{source}: the action space is {space}, whose dimension {unfit[0]} reaches {reach}; {accepted}.")
+    return space
+
+
+def check_observation_space(space: spaces.Space, source: str) -> spaces.Box:
+    """
+    The observation space, if it holds vectors of numbers.
+
+    :raises DatasetError: not a Box of shape (O,)
+    """
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise DatasetError(f"{source}: the observation space is {space}; only a Box of shape (O,) can be learnt from.")
+    return space
+
+
 def check_trajectory(trajectory: Trajectory, observation_space: spaces.Box, action_space: spaces.Box, source: str) -> None:
     """
     Refuse an episode that training must not see.

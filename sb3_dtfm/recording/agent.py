@@ -26,8 +26,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_dtfm.envs  # noqa: F401  (registers the tasks)
-from sb3_dtfm.data.minari import check_action_space
-from sb3_dtfm.data.trajectories import DatasetError
+from sb3_dtfm.data.trajectories import DatasetError, check_action_space
 from sb3_dtfm.recording.episodes import ActFunction, RecordedEpisode, check_recording, run_episodes, show_progress
 
 N_RANDOM_EPISODES = 10

@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 
 from sb3_dtfm.data import DatasetError, Trajectory, TrajectoryBuffer
 from sb3_dtfm.data.storage import STEP_ARRAYS
@@ -71,11 +72,12 @@ def test_windows_end_near_an_episode_s_start_as_often_as_the_exponent_says():
     """Of T steps, the first s hold a share of (s / T)^(1 / e); each episode keeps its share of all."""
     buffer = make_buffer([100, 300, 1]).select(np.array([1, 2, 0]))
     n_draws = 40_000
-    ends = buffer.draw(n_draws, th.Generator().manual_seed(5), timestep_exponent=2.0)
-    episodes = np.searchsorted([300, 301], ends.numpy(), side="right")
-    assert np.bincount(episodes) / n_draws == pytest.approx([300 / 401, 1 / 401, 100 / 401], abs=0.01)
-    for episode, length, first in ((0, 300, 0), (2, 100, 301)):
-        timesteps = ends.numpy()[episodes == episode] - first
+    buffer.observations[:, 0] = th.tensor([0, 1, 2]).repeat_interleave(th.tensor([100, 300, 1]))
+    batch = next(buffer.batches(n_draws, 1, th.Generator().manual_seed(5), timestep_exponent=2.0))
+    episodes, all_timesteps = batch.observations[:, 0, 0].long().numpy(), batch.timesteps[:, 0].numpy()
+    assert np.bincount(episodes) / n_draws == pytest.approx([100 / 401, 300 / 401, 1 / 401], abs=0.01)
+    for episode, length in ((0, 100), (1, 300)):
+        timesteps = all_timesteps[episodes == episode]
         assert timesteps.max() == length - 1
         for share in (0.01, 0.04, 0.25, 0.64):
             assert np.mean(timesteps < share * length) == pytest.approx(share**0.5, abs=0.02)
@@ -85,6 +87,32 @@ def test_sampling_repeats_with_the_same_seed():
     buffer = make_buffer([10, 10])
     first, second = (buffer.sample(32, 5, th.Generator().manual_seed(3)) for _ in range(2))
     assert all(th.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+@pytest.mark.parametrize("timestep_exponent", [1.0, 2.0])
+def test_batches_differ_repeat_with_the_same_seed_and_have_no_end(timestep_exponent: float):
+    buffer = make_buffer([10, 10])
+    first, second = (
+        list(itertools.islice(buffer.batches(32, 5, th.Generator().manual_seed(3), timestep_exponent), 50)) for _ in range(2)
+    )
+    for ours, theirs in zip(first, second, strict=True):
+        assert all(th.equal(a, b) for a, b in zip(ours, theirs, strict=True))
+    assert len({tuple(batch.observations.flatten().tolist()) for batch in first}) == 50
+
+
+def test_batches_are_one_sample_after_the_other():
+    buffer = make_buffer([10, 3]).select(np.array([1, 0]))
+    generator = th.Generator().manual_seed(3)
+    for batch in itertools.islice(buffer.batches(32, 5, th.Generator().manual_seed(3)), 4):
+        for ours, theirs in zip(batch, buffer.sample(32, 5, generator), strict=True):
+            assert th.equal(ours, theirs)
+
+
+def test_batches_take_their_randomness_from_their_generator_alone():
+    buffer = make_buffer([10, 10])
+    state = th.get_rng_state()
+    next(buffer.batches(32, 5, th.Generator().manual_seed(3), 2.0))
+    assert th.equal(th.get_rng_state(), state)
 
 
 def test_episodes_shorter_than_the_context_are_padded_and_kept():
@@ -113,6 +141,62 @@ def test_arrays_are_float32_whatever_was_recorded():
 def test_no_episode_is_refused():
     with pytest.raises(DatasetError, match=r"file.hdf5: holds no episode"):
         TrajectoryBuffer.from_trajectories([], ACTION_SPACE, source="file.hdf5")
+
+
+@pytest.mark.parametrize(
+    ("space", "problem"),
+    [
+        (spaces.Discrete(3), r"Discrete\(3\)"),
+        (spaces.MultiBinary(2), r"MultiBinary\(2\)"),
+        (spaces.Box(-1.0, 1.0, (2, 1), np.float32), r"\(2, 1\)"),
+        (spaces.Box(-1.0, 1.0, (0,), np.float32), r"\(0,\)"),
+        (spaces.Box(-1, 1, (2,), np.int64), "int64"),
+        (spaces.Box(-np.inf, np.inf, (2,), np.float32), "dimension 0 reaches from -inf to inf"),
+        (spaces.Box(np.array([-1, 0.0]), np.array([1, np.inf]), dtype=np.float64), "dimension 1 reaches from 0 to inf"),
+        (spaces.Box(-1e39, 1e39, (2,), np.float64), r"dimension 0 reaches from -1e\+39 to 1e\+39"),
+        (spaces.Box(np.array([-1, 0.5]), np.array([1, 0.5]), dtype=np.float64), "dimension 1 reaches from 0.5 to 0.5"),
+    ],
+)
+def test_actions_that_cannot_be_learnt_are_refused(space: spaces.Space, problem: str):
+    with pytest.raises(DatasetError, match=rf"file.hdf5: the action space is .*{problem}.*only a bounded Box of floats"):
+        TrajectoryBuffer.from_trajectories([make_trajectory(6)], space, source="file.hdf5")
+
+
+@pytest.mark.parametrize(
+    ("observations", "space"),
+    [
+        (np.zeros(6), None),
+        (np.zeros((6, 2, 2)), None),
+        (np.zeros((6, 2)), spaces.Dict(position=spaces.Box(-1.0, 1.0, (2,)))),
+        (np.zeros(6, np.int64), spaces.Discrete(3)),
+    ],
+)
+def test_observations_that_are_no_vectors_are_refused(observations: np.ndarray, space: spaces.Space | None):
+    with pytest.raises(DatasetError, match=r"file.hdf5: the observation space is .*only a Box of shape \(O,\)"):
+        TrajectoryBuffer.from_trajectories(
+            [make_trajectory(6, observations=observations)], ACTION_SPACE, space, source="file.hdf5"
+        )
+
+
+def test_actions_in_float64_are_checked_against_their_bounds_and_clipped():
+    space = spaces.Box(-0.1, 0.1, (2,), np.float64)
+    actions = np.full((6, 2), 0.1)
+    actions[0] = 0.1 + 1e-6, -0.1 - 1e-6
+    buffer = TrajectoryBuffer.from_trajectories([make_trajectory(6, actions=actions)], space)
+    assert buffer.action_space == space
+    assert buffer.actions.dtype == th.float32
+    assert buffer.actions[0].tolist() == [np.float32(0.1), np.float32(-0.1)]
+    actions[3, 1] = 0.1001
+    with pytest.raises(DatasetError, match=r"step 3: action 0.1001 in dimension 1 .*\[-0.1, 0.1\]"):
+        TrajectoryBuffer.from_trajectories([make_trajectory(6, actions=actions)], space)
+
+
+def test_a_buffer_and_all_that_is_made_from_it_know_the_environment():
+    trajectories = [make_trajectory(2), make_trajectory(3)]
+    buffer = TrajectoryBuffer.from_trajectories(trajectories, ACTION_SPACE, env_id="Pendulum-v1")
+    parts = [buffer, buffer.select(np.array([1])), buffer.random_fraction(0.5, 0), buffer.to("cpu")]
+    assert [part.env_id for part in parts] == ["Pendulum-v1"] * 4
+    assert make_buffer([2]).env_id is None
 
 
 def test_rounding_errors_beyond_the_action_bounds_are_clipped():
@@ -190,9 +274,9 @@ def test_sampling_a_selection_covers_exactly_its_steps():
 def test_the_draw_of_a_full_buffer_is_one_randint_over_its_steps():
     """Runs of earlier versions repeat: position and row are the same there."""
     buffer = make_buffer([5, 1, 7, 4])
-    ends = buffer.draw(32, th.Generator().manual_seed(3))
-    assert th.equal(ends, th.randint(17, (32,), generator=th.Generator().manual_seed(3)))
-    assert th.equal(buffer.windows(ends, 1).observations[:, 0], buffer.observations[ends])
+    ends = th.randint(17, (32,), generator=th.Generator().manual_seed(3))
+    batch = buffer.sample(32, 1, th.Generator().manual_seed(3))
+    assert th.equal(batch.observations[:, 0], buffer.observations[ends])
 
 
 @pytest.mark.parametrize("episodes", [*itertools.permutations(range(3), 2), (0, 1, 2)])

@@ -1,6 +1,8 @@
 """Memory-mapped caches: the same data as from memory, made anew when the dataset changes, refused when damaged."""
 
+import itertools
 import json
+import mmap
 import os
 import subprocess
 import sys
@@ -17,8 +19,8 @@ from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
 
 from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer, load_dataset
-from sb3_dtfm.data.cache import Fingerprint, load_cached
-from sb3_dtfm.data.storage import STEP_ARRAYS, FileStorage
+from sb3_dtfm.data.cache import FORMAT, Fingerprint, load_cached
+from sb3_dtfm.data.storage import CAN_ADVISE, STEP_ARRAYS, FileStorage, step_file
 from tests.data.small import ACTION_SPACE, OBSERVATION_SPACE, make_buffer, make_trajectory
 
 
@@ -65,6 +67,7 @@ def assert_same(ours: TrajectoryBuffer, theirs: TrajectoryBuffer) -> None:
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
     assert ours.score_reference == theirs.score_reference
+    assert ours.env_id == theirs.env_id
 
 
 def forbid_reading(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,6 +112,7 @@ def test_a_minari_dataset_is_cached_with_its_score_scale_and_choice_of_episodes(
         )  # fmt: skip
     cached = load_dataset("test/set-v0", cache_dir=tmp_path / "cache")
     assert isinstance(cached.score_reference, ScoreReference)
+    assert cached.env_id == "Pendulum-v1"
     assert_same(cached, load_dataset("test/set-v0"))
     chosen = dataset.filter_episodes(lambda episode: len(episode.rewards) > 4)
     assert load_dataset(chosen, cache_dir=tmp_path / "cache").episode_lengths.tolist() == [7, 5]
@@ -118,19 +122,46 @@ def test_a_minari_dataset_is_cached_with_its_score_scale_and_choice_of_episodes(
 
 def test_windows_fractions_and_statistics_of_a_cache_are_those_from_memory(robomimic_file: Path, tmp_path: Path):
     buffers = [load(robomimic_file, cache).random_fraction(0.5, 1) for cache in (None, tmp_path / "cache")]
-    ends = [buffer.draw(20, th.Generator().manual_seed(0)) for buffer in buffers]
-    assert th.equal(*ends)
-    buffers[1].prefetch(ends[1], 5)
-    windows = [buffer.windows(ends[0], 5) for buffer in buffers]
-    assert all(th.equal(ours, theirs) for ours, theirs in zip(*windows, strict=True))
+    batches = [buffer.batches(20, 5, th.Generator().manual_seed(0), 1.5) for buffer in buffers]
+    for from_memory, cached in itertools.islice(zip(*batches, strict=True), 3):
+        assert all(th.equal(ours, theirs) for ours, theirs in zip(cached, from_memory, strict=True))
     for ours, theirs in zip(*(buffer.statistics() for buffer in buffers), strict=True):
         np.testing.assert_array_equal(ours, theirs)
 
 
-def test_every_window_can_be_prefetched(robomimic_file: Path, tmp_path: Path):
-    """The first window starts before the file does, and the last one stops where it ends."""
-    buffer = load(robomimic_file, tmp_path / "cache")
-    buffer.prefetch(th.arange(len(buffer)), 20)
+class RecordedAdvice:
+    """Stands before a memory map and remembers which bytes the system was asked to read."""
+
+    def __init__(self, map_: mmap.mmap) -> None:
+        self._map, self.asked = map_, []
+
+    def madvise(self, option: int, start: int, length: int) -> None:
+        self._map.madvise(option, start, length)  # refuses what lies outside of the file
+        assert option == mmap.MADV_WILLNEED
+        self.asked.append((start, start + length))
+
+
+@pytest.mark.skipif(not CAN_ADVISE, reason="needs madvise")
+@pytest.mark.parametrize("context_length", [1, 5, 300, 2000])
+def test_the_next_batch_is_asked_for_before_the_present_one_is_handed_out(context_length: int, tmp_path: Path):
+    """All of its windows, also the first one, which starts before the file does, and the one that stops where it ends."""
+    n_steps, batch_size = 1501, 5000
+    buffer = load_cached(tmp_path, Fingerprint("set", "", "", ""), fill([700, 1, 800]))
+    for steps in buffer._maps:
+        steps._map = RecordedAdvice(steps._map)
+    next(buffer.batches(batch_size, context_length, th.Generator().manual_seed(0)))
+    generator = th.Generator().manual_seed(0)
+    drawn = [end for _ in range(2) for end in th.randint(n_steps, (batch_size,), generator=generator).tolist()]
+    assert {0, n_steps - 1} <= set(drawn[batch_size:])
+    tensors = {steps.tensor.data_ptr(): steps for steps in buffer._maps}
+    for name in ("observations", "actions", "returns_to_go"):
+        values = getattr(buffer, name)
+        row_bytes = values.nbytes // n_steps
+        offset = step_file(only_folder(tmp_path), name).stat().st_size - values.nbytes
+        asked = tensors[values.data_ptr()]._map.asked
+        for (start, stop), end in zip(asked, drawn, strict=True):
+            assert start <= offset + max(0, end + 1 - context_length) * row_bytes < start + mmap.PAGESIZE
+            assert stop == offset + (end + 1) * row_bytes
 
 
 def test_what_is_written_to_a_buffer_does_not_reach_the_cache(robomimic_file: Path, tmp_path: Path):
@@ -158,9 +189,11 @@ def test_a_changed_file_replaces_its_cache(robomimic_file: Path, tmp_path: Path)
 def test_a_cache_of_an_older_format_is_made_anew(robomimic_file: Path, tmp_path: Path):
     load(robomimic_file, tmp_path / "cache")
     description = only_folder(tmp_path / "cache") / "cache.json"
-    description.write_text(description.read_text().replace('"format": 1', '"format": 0'))
-    load(robomimic_file, tmp_path / "cache")
-    assert json.loads(description.read_text())["format"] == 1
+    description.write_text(json.dumps({**json.loads(description.read_text()), "format": FORMAT - 1}))
+    forged = only_folder(tmp_path / "cache") / "rewards.npy"
+    forged.write_bytes(b"of an older format")
+    assert_same(load(robomimic_file, tmp_path / "cache"), load(robomimic_file, None))
+    assert json.loads(description.read_text())["format"] == FORMAT
 
 
 def test_a_dataset_that_is_refused_leaves_no_cache(robomimic_file: Path, tmp_path: Path):
@@ -180,7 +213,7 @@ from tests.data.small import ACTION_SPACE, make_trajectory
 def episodes():
     yield make_trajectory(5)
     os.kill(os.getpid(), 9)
-load_cached(pathlib.Path(r"{tmp_path}"), Fingerprint("set", "", ""), "set",
+load_cached(pathlib.Path(r"{tmp_path}"), Fingerprint("set", "", "", ""),
     lambda storage: TrajectoryBuffer.from_trajectories(episodes(), ACTION_SPACE, storage=storage))
 """
     root = Path(__file__).parents[2]
@@ -188,7 +221,7 @@ load_cached(pathlib.Path(r"{tmp_path}"), Fingerprint("set", "", ""), "set",
     assert subprocess.run([sys.executable, "-c", script], env=environment, cwd=root, check=False).returncode == -9
     [left] = folders(tmp_path)
     assert left.endswith(".part")
-    buffer = load_cached(tmp_path, Fingerprint("set", "", ""), "set", fill([5, 3]))
+    buffer = load_cached(tmp_path, Fingerprint("set", "", "", ""), fill([5, 3]))
     assert_same(buffer, make_buffer([5, 3]))
     assert not only_folder(tmp_path).name.endswith(".part")
 
@@ -221,6 +254,36 @@ def test_a_cache_that_cannot_be_written_is_named(robomimic_file: Path, tmp_path:
         load(robomimic_file, tmp_path / "cache")
 
 
+@pytest.mark.parametrize("env_id", [None, "Pendulum-v1"])
+def test_a_cache_keeps_the_spaces_with_their_precision_and_the_environment(env_id: str | None, tmp_path: Path):
+    boxes = [spaces.Box(-0.1, 0.1, (2,), np.float64), spaces.Box(-np.inf, np.inf, (3,), np.float64)]
+    trajectories = [make_trajectory(4, actions=np.full((4, 2), 0.1))]
+
+    def read(storage: FileStorage | None) -> TrajectoryBuffer:
+        return TrajectoryBuffer.from_trajectories(trajectories, *boxes, env_id=env_id, storage=storage)
+
+    cached = load_cached(tmp_path, Fingerprint("set", "", "", ""), read)
+    assert_same(cached, read(None))
+    assert (cached.action_space.dtype, cached.env_id) == (np.float64, env_id)
+
+
+def test_an_environment_of_one_s_own_choice_stays_out_of_the_cache(robomimic_file: Path, tmp_path: Path):
+    env_ids = ["Walker2d-v5", None, "Walker2d-v5"]
+    found = [load(robomimic_file, tmp_path / "cache", env_id=env_id).env_id for env_id in env_ids]
+    assert found == ["Walker2d-v5", "robosuite/Lift-v0", "Walker2d-v5"]
+    assert len(folders(tmp_path / "cache")) == 1
+
+
+@pytest.mark.parametrize("problem", ["does not exist", "is a folder"])
+def test_a_missing_file_leaves_no_cache(problem: str, tmp_path: Path):
+    path = tmp_path / "lift.hdf5"
+    if problem == "is a folder":
+        path.mkdir()
+    with pytest.raises(DatasetError, match=f"lift.hdf5 {problem}"):
+        load(path, tmp_path / "cache")
+    assert not (tmp_path / "cache").exists()
+
+
 def test_a_full_disk_is_no_fault_of_the_dataset(tmp_path: Path):
     (tmp_path / "observations.npy").symlink_to("/dev/full")
     storage = FileStorage(tmp_path, "test")
@@ -229,5 +292,5 @@ def test_a_full_disk_is_no_fault_of_the_dataset(tmp_path: Path):
 
 
 def test_a_buffer_has_no_cache(tmp_path: Path):
-    with pytest.raises(TypeError, match="unknown option cache_dir; accepted: none"):
+    with pytest.raises(TypeError, match="unknown option cache_dir; accepted: env_id"):
         load_dataset(make_buffer([2]), cache_dir=tmp_path)

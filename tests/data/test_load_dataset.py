@@ -12,7 +12,9 @@ import pytest
 from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
 
-from sb3_dtfm.data import DatasetError, Trajectory, TrajectoryBuffer, load_dataset
+from sb3_dtfm.data import DatasetError, Trajectory, TrajectoryBuffer, load_dataset, readers
+from sb3_dtfm.data.cache import Fingerprint
+from sb3_dtfm.data.storage import FileStorage
 
 LIFT = {"robot0_eef_pos": 3, "robot0_eef_quat": 4, "robot0_gripper_qpos": 2, "object": 10}
 
@@ -86,6 +88,60 @@ def test_options_reach_the_reader(robomimic_file: Path):
     assert (buffer.n_episodes, buffer.observation_space.shape) == (1, (3,))
 
 
+def test_a_file_that_is_called_like_a_minari_dataset_is_read(robomimic_file: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(robomimic_file.parent)
+    robomimic_file.rename("lift-v0")
+    assert load_dataset("lift-v0").n_episodes == 2
+
+
+def test_a_path_in_the_home_folder_is_read(robomimic_file: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("HOME", str(robomimic_file.parent))
+    assert load_dataset("~/lift.hdf5").n_episodes == 2
+
+
+def test_a_further_reader_is_one_row_of_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def load_numpy(path: str, scale: float = 1.0, storage: FileStorage | None = None) -> TrajectoryBuffer:
+        with np.load(path) as arrays:
+            trajectory = Trajectory(arrays["observations"], arrays["actions"], scale * arrays["rewards"])
+        return TrajectoryBuffer.from_trajectories([trajectory], spaces.Box(-1.0, 1.0, (1,)), storage=storage)
+
+    def fingerprint_numpy(path: str, options: dict[str, Any]) -> Fingerprint:
+        return Fingerprint.of(Path(path).name, Path(path), options)
+
+    row = readers.Reader("the path of an .npz file", lambda name: str(name).endswith(".npz"), load_numpy, fingerprint_numpy)
+    monkeypatch.setattr(readers, "READERS", (row, *readers.READERS))
+    path = str(tmp_path / "episode.npz")
+    np.savez(path, observations=np.zeros((3, 2)), actions=np.zeros((3, 1)), rewards=np.ones(3))
+    for cache_dir in (None, tmp_path / "cache"):
+        buffer = load_dataset(path, cache_dir=cache_dir, scale=2.0, env_id="Own-v0")
+        assert (buffer.episode_returns.tolist(), buffer.env_id, buffer.memory_mapped) == (
+            [6.0],
+            "Own-v0",
+            cache_dir is not None,
+        )
+    with pytest.raises(TypeError, match="unknown option filter_key; accepted: scale, cache_dir, env_id"):
+        load_dataset(path, filter_key="train")
+    with pytest.raises(DatasetError, match=r"accepted are the path of an .npz file, the path of a robomimic file"):
+        load_dataset("halfcheetah")
+
+
+def test_the_environment_is_the_one_that_the_file_names_unless_one_is_given(
+    robomimic_file: Path, minari_dataset: minari.MinariDataset
+):
+    assert load_dataset(robomimic_file).env_id == "robosuite/Lift-v0"
+    assert load_dataset(robomimic_file, env_id="Walker2d-v5").env_id == "Walker2d-v5"
+    assert load_dataset(minari_dataset).env_id is None
+    assert load_dataset(minari_dataset, env_id="Walker2d-v5").env_id == "Walker2d-v5"
+
+
+def test_an_environment_that_is_given_leaves_the_buffer_as_it_was():
+    trajectory = Trajectory(np.zeros((2, 1)), np.zeros((2, 1)), np.zeros(2))
+    buffer = TrajectoryBuffer.from_trajectories([trajectory], spaces.Box(-1.0, 1.0, (1,)), env_id="Hopper-v5")
+    given = load_dataset(buffer, env_id="Walker2d-v5")
+    assert (given.env_id, buffer.env_id) == ("Walker2d-v5", "Hopper-v5")
+    assert given.observations is buffer.observations
+
+
 def test_a_buffer_is_returned_as_it_is():
     trajectory = Trajectory(np.zeros((2, 1)), np.zeros((2, 1)), np.zeros(2))
     buffer = TrajectoryBuffer.from_trajectories([trajectory], spaces.Box(-1.0, 1.0, (1,)))
@@ -105,12 +161,12 @@ def test_a_folder_is_no_dataset(tmp_path: Path):
 
 @pytest.mark.parametrize("dataset", ["halfcheetah", "mujoco/halfcheetah/expert", "", 3, None, [1, 2], {"path": "x"}])
 def test_anything_else_is_refused_with_what_is_accepted(dataset: Any):
-    with pytest.raises(DatasetError, match="accepted are a Minari id"):
+    with pytest.raises(DatasetError, match=r"accepted are the path of .* a Minari id .* a TrajectoryBuffer"):
         load_dataset(dataset)
 
 
 def test_an_unknown_option_is_refused_with_those_there_are(robomimic_file: Path, minari_dataset: minari.MinariDataset):
-    with pytest.raises(TypeError, match="unknown option filter; accepted: filter_key, observation_keys, cache_dir"):
+    with pytest.raises(TypeError, match="unknown option filter; accepted: filter_key, observation_keys, cache_dir, env_id"):
         load_dataset(robomimic_file, filter="train")
-    with pytest.raises(TypeError, match="test/ones-v0: unknown option filter_key; accepted: cache_dir"):
+    with pytest.raises(TypeError, match="test/ones-v0: unknown option filter_key; accepted: cache_dir, env_id"):
         load_dataset("test/ones-v0", filter_key="train")

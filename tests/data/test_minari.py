@@ -235,10 +235,33 @@ def test_wrong_numbers_are_named_with_episode_and_step(changes: dict[str, Any], 
         load_minari("test/set-v0")
 
 
+def test_the_environment_is_named_without_being_built(monkeypatch: pytest.MonkeyPatch):
+    write([make_episode(3)], env="Pendulum-v1")
+    write([make_episode(3)], "test/without-v0")
+
+    def no_environment(*args: Any, **kwargs: Any) -> None:
+        raise AssertionError("an environment is built")
+
+    monkeypatch.setattr(gym, "make", no_environment)
+    assert load_minari("test/set-v0").env_id == "Pendulum-v1"
+    assert load_minari("test/without-v0").env_id is None
+
+
+@pytest.mark.parametrize("data_format", ["hdf5", "arrow"])
+def test_actions_in_float64_are_read(data_format: str):
+    """FrankaKitchen has such an action space."""
+    space = spaces.Box(-0.4, 0.4, (2,), np.float64)
+    actions = np.random.default_rng(0).uniform(-0.4, 0.4, (5, 2))
+    buffer = load_minari(write([make_episode(5, actions=actions)], action_space=space, data_format=data_format))
+    assert buffer.action_space == space
+    np.testing.assert_array_equal(buffer.actions.numpy(), actions.astype(np.float32))
+
+
 @pytest.mark.parametrize(
     ("space", "actions"),
     [
         (spaces.Discrete(3), np.zeros(3, np.int64)),
+        (spaces.Box(-1, 1, (2,), np.int64), np.zeros((3, 2), np.int64)),
         (spaces.Box(-np.inf, np.inf, (2,), np.float32), np.zeros((3, 2), np.float32)),
     ],
 )

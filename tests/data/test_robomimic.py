@@ -201,7 +201,7 @@ def refused(path, **arguments):
 
 
 def test_missing_file_is_named(path):
-    assert "no such file" in refused(path)
+    assert "does not exist" in refused(path)
 
 
 def test_other_kinds_of_file_are_named(path):
@@ -313,6 +313,20 @@ def test_nan_reward_is_named(path):
 def test_absolute_actions_are_refused(path, controller):
     write(path, {"demo_0": make_demo(3)}, env_args(controller_configs={**OLD_CONTROLLER, **controller}))
     assert "only files with a delta controller are accepted" in refused(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "env_id"), [("Lift", "robosuite/Lift-v0"), ("PickPlaceCan", "robosuite/Can-v0"), ("NoSuchTask", None)]
+)
+def test_the_environment_is_the_registered_one_of_the_file_s_task(path, name, env_id):
+    assert load_robomimic(write(path, {"demo_0": make_demo(3)}, env_args(name))).env_id == env_id
+
+
+def test_a_file_that_names_no_environment_is_read(path):
+    write(path, {"demo_0": make_demo(3)})
+    with h5py.File(path, "a") as file:
+        del file["data"].attrs["env_args"]
+    assert load_robomimic(path).env_id is None
 
 
 def test_broken_env_args_are_named(path):
