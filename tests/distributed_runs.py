@@ -1,6 +1,9 @@
 """What tests/test_distributed.py starts on two processes with torchrun, and compares with this process alone."""
 
+import itertools
 import sys
+import time
+from datetime import timedelta
 from pathlib import Path
 from unittest.mock import patch
 
@@ -12,12 +15,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
+from sb3_dtfm.distributed import first_of_each_machine_first
 from sb3_dtfm.networks import trunk
 from sb3_dtfm.networks.dropout import dropout
 from tests.conftest import TINY_FLOW_POLICY, TINY_POLICY
 
 ALGORITHMS = {"DT": (DT, TINY_POLICY), "DTFM": (DTFM, {**TINY_FLOW_POLICY, "regression_coef": 0.5})}
 N_STEPS = 12
+DOWNLOAD = 6.0  # seconds
 
 
 def make_buffer() -> TrajectoryBuffer:
@@ -33,8 +38,6 @@ def make_buffer() -> TrajectoryBuffer:
 def make_model(name: str, **kwargs):
     algorithm, settings = ALGORITHMS[name]
     settings = {"dropout": 0.0, **settings, **kwargs.pop("policy_kwargs", {})}
-    if "regression_coef" in settings:
-        kwargs["regression_coef"] = settings.pop("regression_coef")
     arguments = dict(batch_size=64, context_length=8, seed=0, learning_rate=1e-3, ema_decay=0.9, precision="float32")
     arguments |= dict(max_grad_norm=0.5, device="cpu", policy_kwargs=settings)
     return algorithm("MultiInputPolicy", dataset=make_buffer(), **{**arguments, **kwargs})
@@ -63,18 +66,19 @@ def run_without_a_seed() -> dict:
     """What a process sees of a run with `seed=None`, dropout, and a callback that stops it."""
     model = make_model("DTFM", seed=None, policy_kwargs={"dropout": 0.5})
     drawn, dropped = [], []
-    sample = model.buffer.sample
+    batches = model.buffer.batches
 
-    def recording_sample(*args):
-        drawn.append(sample(*args))
-        return drawn[-1]
+    def recording_batches(*args, **kwargs):
+        for batch in batches(*args, **kwargs):
+            drawn.append(batch)
+            yield batch
 
     def recording_dropout(tokens, probability, training):
         output = dropout(tokens, probability, training)
         dropped.append(output.detach() == 0)
         return output
 
-    model.buffer.sample = recording_sample
+    model.buffer.batches = recording_batches
     callback = StopAt(5)
     with patch.object(trunk, "dropout", recording_dropout):
         model.learn(50, callback=callback, log_interval=None)
@@ -95,16 +99,36 @@ def refusal_of_an_odd_batch() -> str:
     return ""
 
 
+def wait_for_a_slow_download() -> float:
+    """
+    Process 1 waits for longer than the processes' messages to each other may take.
+
+    :return: seconds waited
+    """
+    dist.barrier()  # both are here: to meet again has the same limit
+    dist.destroy_process_group()
+    dist.init_process_group("gloo", timeout=timedelta(seconds=DOWNLOAD / 2))
+    start = time.monotonic()
+    with first_of_each_machine_first():
+        if dist.get_rank() == 0:
+            time.sleep(DOWNLOAD)
+    waited = time.monotonic() - start
+    dist.destroy_process_group()
+    dist.init_process_group("gloo")
+    return waited
+
+
 def fail_on_process_1(step: int) -> None:
-    """Training on which process 1 fails; without an end of its own for the others."""
+    """Training whose data process 1 can no longer read after some steps; without an end of its own for the others."""
     model = make_model("DT")
+    batches = model.buffer.batches
 
-    def gradient_step(*args):
-        if dist.get_rank() == 1 and model.num_timesteps == step:
-            raise RuntimeError("process 1 fails on purpose")
-        return type(model)._gradient_step(model, *args)
+    def failing_batches(*args, **kwargs):
+        yield from itertools.islice(batches(*args, **kwargs), step)
+        raise RuntimeError("process 1 fails on purpose")
 
-    model._gradient_step = gradient_step
+    if dist.get_rank() == 1:
+        model.buffer.batches = failing_batches
     model.learn(10**9)
 
 
@@ -116,6 +140,7 @@ def main(folder: Path) -> None:
         model = train(name, folder / name / f"process_{dist.get_rank()}")
         results[name] = model.policy.state_dict()
     th.save(results, folder / f"process_{dist.get_rank()}.pt")
+    th.save(wait_for_a_slow_download(), folder / f"download_{dist.get_rank()}.pt")
     dist.barrier()
     fail_on_process_1(step=3)
 

@@ -9,7 +9,7 @@ import pytest
 import torch as th
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from tests.distributed_runs import ALGORITHMS, N_STEPS, train
+from tests.distributed_runs import ALGORITHMS, DOWNLOAD, N_STEPS, train
 
 ROOT = Path(__file__).parents[1]
 LIMIT = 60  # seconds after which two processes that wait for each other are taken as hanging
@@ -68,6 +68,9 @@ def test_only_process_0_writes(name, finished):
 
 def test_without_a_seed_processes_share_batches_and_weights_but_not_dropout(finished):
     first, second = (seen["without seed"] for seen in finished[2])
+    assert len(first["batches"]) >= 5
+    assert len(first["dropped"]) > 0
+    assert not th.equal(first["batches"][0][0], first["batches"][1][0])
     for ours, theirs in zip(first["batches"], second["batches"], strict=True):
         assert all(th.equal(*tensors) for tensors in zip(ours, theirs, strict=True))
     assert all_equal(first["state"], second["state"])
@@ -81,6 +84,14 @@ def test_a_callback_runs_on_process_0_and_stops_all(finished):
 def test_a_batch_that_cannot_be_shared_is_refused(finished):
     for seen in finished[2]:
         assert "batch_size=63 and 2 processes" in seen["odd batch"]
+
+
+def test_a_download_may_take_longer_than_a_message(finished):
+    """Process 1 waits for process 0 however long it takes."""
+    folder, process, _ = finished
+    waits = [folder / f"download_{rank}.pt" for rank in range(2)]
+    assert all(file.is_file() for file in waits), process.stderr
+    assert all(th.load(file) > 0.9 * DOWNLOAD for file in waits)
 
 
 def test_a_process_that_fails_ends_all(finished):

@@ -1,0 +1,156 @@
+"""Every argument is checked by name, before anything is learned: at construction, and where `load` changes it."""
+
+import re
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_dtfm import DT, DTFM
+from tests.algorithms.small import make_model
+
+NAN = float("nan")
+# For each argument what is refused.
+REFUSED = {
+    "batch_size": (0, -1, 2.5, True, "16"),
+    "context_length": (0, 2.5, True),
+    "max_grad_norm": (-1, NAN),
+    "warmup_steps": (-5, 2.5),
+    "weight_decay": (-1, NAN),
+    "learning_rate": (0, -1, NAN),
+    "ema_decay": (1.0, -0.1, NAN),
+    "dataset_fraction": (0, 1.5, NAN),
+    "timestep_exponent": (0, -1.0, float("inf"), NAN),
+    "precision": ("float8",),
+    "learning_rate_schedule": ("step",),
+}
+REFUSED_OF_THE_POLICY = {
+    "embed_dim": (0, 2.5),
+    "n_layers": (0, 2.5),
+    "n_heads": (0, 2.5),
+    "dropout": (1.0, -0.1, NAN),
+}
+REFUSED_OF_THE_FLOW = {
+    "flow_hidden_dim": (0, 2.5),
+    "flow_n_layers": (0, 2.5),
+    "n_solver_steps": (0, 2.5),
+    "flow_tau_exponent": (0, NAN),
+    "flow_prediction": ("noise",),
+    "solver": ("leapfrog",),
+    "regression_coef": (-1, NAN),
+}
+# Where a value is one of a few words, the refusal lists them.
+CHOICES = {
+    "precision": ("auto", "float32", "bfloat16"),
+    "learning_rate_schedule": ("constant", "linear", "cosine"),
+    "flow_prediction": ("velocity", "action"),
+    "solver": ("euler", "midpoint", "heun", "rk4", "one_step"),
+}
+
+
+def pairs(refused):
+    return [pytest.param(name, value, id=f"{name}={value}") for name, values in refused.items() for value in values]
+
+
+def check_refusal(message: str, name: str, value) -> None:
+    """The message names the argument, what would be accepted and what was given."""
+    assert re.search(rf"\b{name} must .+\bgot {re.escape(repr(value))}", message), message
+    assert all(choice in message for choice in CHOICES.get(name, ()))
+
+
+@pytest.fixture(scope="module")
+def saved(cheetah_buffer, tmp_path_factory):
+    """A saved model by its algorithm."""
+    folder = tmp_path_factory.mktemp("saved")
+    for algorithm in (DT, DTFM):
+        make_model(algorithm, cheetah_buffer).save(folder / algorithm.__name__)
+    return folder
+
+
+@pytest.mark.parametrize("algorithm", [DT, DTFM])
+@pytest.mark.parametrize(("name", "value"), pairs(REFUSED))
+def test_an_argument_out_of_range_is_refused(name, value, algorithm, cheetah_buffer):
+    with pytest.raises(ValueError, match=name) as refusal:
+        make_model(algorithm, cheetah_buffer, **{name: value})
+    check_refusal(str(refusal.value), name, value)
+
+
+@pytest.mark.parametrize(("name", "value"), pairs(REFUSED))
+def test_an_argument_out_of_range_is_refused_at_load(name, value, cheetah_buffer, saved):
+    """Also without data, since a model that cannot learn later should say so at once."""
+    for kwargs in ({"dataset": cheetah_buffer}, {}):
+        with pytest.raises(ValueError, match=name) as refusal:
+            DT.load(saved / "DT", **{name: value}, **kwargs)
+        check_refusal(str(refusal.value), name, value)
+
+
+@pytest.mark.parametrize(("name", "value"), pairs(REFUSED_OF_THE_POLICY))
+def test_an_argument_of_the_policy_out_of_range_is_refused(name, value, cheetah_buffer):
+    for algorithm in (DT, DTFM):
+        with pytest.raises(ValueError, match=name) as refusal:
+            make_model(algorithm, cheetah_buffer, policy_kwargs={name: value})
+        check_refusal(str(refusal.value), name, value)
+
+
+@pytest.mark.parametrize(("name", "value"), pairs(REFUSED_OF_THE_FLOW))
+def test_an_argument_of_the_flow_out_of_range_is_refused(name, value, cheetah_buffer):
+    with pytest.raises(ValueError, match=name) as refusal:
+        make_model(DTFM, cheetah_buffer, policy_kwargs={name: value})
+    check_refusal(str(refusal.value), name, value)
+
+
+@pytest.mark.parametrize(("algorithm", "name"), [(DT, "embed_dims"), (DTFM, "flow_hidden"), (DT, "flow_hidden_dim")])
+def test_an_unknown_argument_of_the_policy_is_refused_with_those_accepted(algorithm, name, cheetah_buffer):
+    """What only DTFM knows is unknown to DT."""
+    with pytest.raises(ValueError, match=rf"policy_kwargs.*\b{name}\b") as refusal:
+        make_model(algorithm, cheetah_buffer, policy_kwargs={name: 64})
+    own = {"embed_dim", "n_layers", "n_heads", "dropout", "timestep_embedding", "clip_return_to_go", "kv_cache"}
+    flow = {"flow_hidden_dim", "flow_n_layers", "flow_prediction", "solver", "n_solver_steps", "regression_coef"}
+    words = re.findall(r"\w+", str(refusal.value).partition("accepted")[2])
+    assert own <= set(words)
+    assert flow <= set(words) if algorithm is DTFM else not flow & set(words)
+
+
+@pytest.mark.parametrize("algorithm", [DT, DTFM])
+def test_numbers_of_numpy_are_numbers(algorithm, cheetah_buffer, tmp_path):
+    """As a search or a grid made with NumPy gives them; saved and loaded, they are what they were."""
+    given = dict(
+        batch_size=np.int64(8), context_length=np.int32(4), learning_rate=np.float32(1e-3), weight_decay=np.float64(0.01),
+        warmup_steps=np.int64(2), max_grad_norm=np.float32(0.5), ema_decay=np.float64(0.9),
+    )  # fmt: skip
+    sizes = {"embed_dim": np.int64(16), "n_layers": np.int64(1), "dropout": np.float32(0.1)}
+    model = make_model(algorithm, cheetah_buffer, **given, policy_kwargs=sizes).learn(2)
+    model.save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model")
+    assert (loaded.batch_size, loaded.context_length, loaded.policy.embed_dim) == (8, 4, 16)
+    assert loaded.learning_rate == np.float32(1e-3)
+
+
+def weights(model):
+    return th.cat([parameter.detach().flatten() for parameter in model.policy.parameters()])
+
+
+@pytest.mark.parametrize("off", [0, 0.0])
+def test_no_gradient_norm_is_off(off, cheetah_buffer):
+    """Neither clipped to nothing nor turned round: what is learned is what None learns, and not what a bound gives."""
+    without, given, clipped = (make_model(DT, cheetah_buffer, max_grad_norm=norm).learn(3) for norm in (None, off, 1e-12))
+    assert th.equal(weights(given), weights(without))
+    assert not th.equal(weights(clipped), weights(without))
+
+
+def test_no_warm_up_is_off(cheetah_buffer):
+    """The first step already has the whole learning rate."""
+    rates = []
+    model = make_model(DT, cheetah_buffer, warmup_steps=0, learning_rate=0.5e-3)
+    model.learn(1, callback=lambda *_: rates.append(model.policy.optimizer.param_groups[0]["lr"]) is None)
+    assert rates == [0.5e-3]
+
+
+def test_a_schedule_is_a_learning_rate(cheetah_buffer, saved):
+    for model in (
+        make_model(DT, cheetah_buffer, learning_rate=lambda remaining: 1e-3 * remaining),
+        DT.load(saved / "DT", dataset=cheetah_buffer, learning_rate=lambda remaining: 1e-3 * remaining),
+    ):
+        rates = []
+        model.learn(2, callback=lambda *_: rates.append(model.policy.optimizer.param_groups[0]["lr"]) is None)  # noqa: B023
+        assert rates == pytest.approx([1e-3, 0.5e-3])

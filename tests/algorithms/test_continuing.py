@@ -1,0 +1,86 @@
+"""Training that goes on: after `load`, and in a second `learn`."""
+
+import numpy as np
+import pytest
+from stable_baselines3.common.callbacks import CallbackList, EvalCallback, EveryNTimesteps
+from stable_baselines3.common.monitor import Monitor
+
+from sb3_dtfm import DT, DTFM
+from sb3_dtfm.data import ScoreReference, Trajectory, TrajectoryBuffer
+from tests.algorithms.small import learn_losses, make_model, record_curves
+from tests.conftest import make_env, record_random_episodes
+
+# So slow that the weights stay as they are: what the loss then shows is the batch and the noise.
+STANDSTILL = dict(learning_rate=1e-12, weight_decay=0.0, precision="float32", policy_kwargs=dict(dropout=0.0))
+SCALE = ScoreReference(-100.0, 100.0, "two returns for a test")
+
+
+@pytest.fixture(scope="module")
+def scored_buffer(cheetah_buffer):
+    return TrajectoryBuffer.from_trajectories(
+        record_random_episodes(2), cheetah_buffer.action_space, score_reference=SCALE, source="scored cheetah"
+    )
+
+
+@pytest.fixture(scope="module")
+def one_step_buffer(cheetah_buffer):
+    """A single recorded step: every batch is the same."""
+    episode = record_random_episodes(1)[0]
+    step = Trajectory(episode.observations[:1], episode.actions[:1], episode.rewards[:1])
+    return TrajectoryBuffer.from_trajectories([step], cheetah_buffer.action_space)
+
+
+def evaluation(eval_freq=1):
+    return EvalCallback(Monitor(make_env()), eval_freq=eval_freq, n_eval_episodes=1, verbose=0)
+
+
+@pytest.mark.parametrize("verbose", [0, 1])
+@pytest.mark.parametrize("algorithm", [DT, DTFM])
+def test_a_loaded_model_learns_with_evaluation_on_scored_data(algorithm, verbose, scored_buffer, tmp_path):
+    """Verbose, the callback also says what the scale is."""
+    make_model(algorithm, scored_buffer).save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model", dataset=scored_buffer, verbose=verbose)
+    assert loaded.score_reference == SCALE
+    curves = record_curves(loaded)
+    loaded.learn(2, callback=evaluation(eval_freq=2))
+    ((_, mean_reward),) = curves.points["eval/mean_reward"]
+    assert curves.points["eval/normalized_score"] == [(2, pytest.approx((mean_reward + 100.0) / 200.0))]
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_a_normalised_score_is_logged_once_an_evaluation(nested, scored_buffer):
+    """Not at the steps between, of which there is no result; also where SB3's own event decides when to evaluate."""
+    model = make_model(DT, scored_buffer)
+    curves = record_curves(model)
+    event = EveryNTimesteps(4, evaluation())
+    model.learn(10, callback=CallbackList([event]) if nested else event)
+    rewards, scores = curves.points["eval/mean_reward"], curves.points["eval/normalized_score"]
+    assert [step for step, _ in rewards] == [4, 8]
+    assert scores == [(step, pytest.approx((reward + 100.0) / 200.0)) for step, reward in rewards]
+
+
+@pytest.mark.parametrize("algorithm", [DT, DTFM])
+@pytest.mark.parametrize("reset_num_timesteps", [True, False])
+def test_a_second_learn_draws_new_batches(algorithm, reset_num_timesteps, cheetah_buffer, tmp_path):
+    model = make_model(algorithm, cheetah_buffer, **STANDSTILL)
+    first = learn_losses(model, 5)
+    model.save(tmp_path / "model")
+    second = learn_losses(model, 5, reset_num_timesteps=reset_num_timesteps)
+    loaded = algorithm.load(tmp_path / "model", dataset=cheetah_buffer)
+    assert not np.isclose(first, second, rtol=1e-5).any()
+    assert np.array_equal(second, learn_losses(loaded, 5, reset_num_timesteps=reset_num_timesteps))
+    third = learn_losses(loaded, 5, reset_num_timesteps=reset_num_timesteps)
+    assert not np.isclose(third, first, rtol=1e-5).any()
+    assert not np.isclose(third, second, rtol=1e-5).any()
+    assert np.array_equal(first, learn_losses(make_model(algorithm, cheetah_buffer, **STANDSTILL), 5))
+
+
+def test_a_second_learn_draws_new_noise(one_step_buffer, tmp_path):
+    assert np.ptp(learn_losses(make_model(DT, one_step_buffer, **STANDSTILL), 5)) < 1e-6
+    model = make_model(DTFM, one_step_buffer, **STANDSTILL)
+    first = learn_losses(model, 5)
+    model.save(tmp_path / "model")
+    second = learn_losses(model, 5)
+    assert not np.isclose(first, second, rtol=1e-5).any()
+    assert np.array_equal(second, learn_losses(DTFM.load(tmp_path / "model", dataset=one_step_buffer), 5))
+    assert np.array_equal(first, learn_losses(make_model(DTFM, one_step_buffer, **STANDSTILL), 5))

@@ -1,0 +1,52 @@
+"""Threads that share a model, each with its own `state`, act as each alone."""
+
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+
+import numpy as np
+import pytest
+
+from sb3_dtfm import DT, DTFM
+from tests.conftest import TINY_FLOW_POLICY, TINY_POLICY, record_random_episodes
+
+N_THREADS = 8
+
+
+@pytest.fixture
+def frequent_switches():
+    """Threads give way to one another far more often than they would by themselves."""
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    yield
+    sys.setswitchinterval(interval)
+
+
+def roll(model, observations: np.ndarray, barrier: Barrier | None = None) -> np.ndarray:
+    """Actions along recorded observations, (T, O)."""
+    actions, state, episode_start = [], None, np.array([True])
+    if barrier is not None:
+        barrier.wait()
+    for t, values in enumerate(observations):
+        observation = dict(observation=values, return_to_go=np.zeros(1), timestep=np.array([t]))
+        action, state = model.predict(observation, state, episode_start, deterministic=True)
+        actions.append(action)
+        episode_start = np.array([False])
+    return np.array(actions)
+
+
+@pytest.mark.parametrize("kv_cache", [False, True])
+@pytest.mark.parametrize(("algorithm", "policy_kwargs"), [(DT, TINY_POLICY), (DTFM, TINY_FLOW_POLICY)])
+def test_threads_with_their_own_states_act_as_alone_to_the_bit(
+    algorithm, policy_kwargs, kv_cache, cheetah_buffer, frequent_switches
+):
+    """Over the window's slide, and over the moves of whatever is kept behind it."""
+    policy_kwargs = dict(policy_kwargs, kv_cache=kv_cache)
+    model = algorithm("MultiInputPolicy", dataset=cheetah_buffer, context_length=5, policy_kwargs=policy_kwargs, seed=0)
+    episodes = [episode.observations for episode in record_random_episodes(N_THREADS, seed=100)]
+    expected = [roll(model, observations) for observations in episodes]
+    barrier = Barrier(N_THREADS)
+    with ThreadPoolExecutor(N_THREADS) as pool:
+        for _ in range(3):
+            together = pool.map(lambda observations: roll(model, observations, barrier), episodes)
+            assert np.array_equal(list(together), expected)
