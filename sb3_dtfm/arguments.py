@@ -41,9 +41,8 @@ class Number(NamedTuple):
             limits = "" if math.isinf(self.low) else f" {'above' if self.above_low else 'of at least'} {self.low:g}"
             text = f"a {'' if limits else 'finite '}{kind}{limits}"
         else:
-            text = (
-                f"a {kind} in {'(' if self.above_low else '['}{self.low:g}, {self.high:g}{')' if self.below_high else ']'}"
-            )
+            left, right = "(" if self.above_low else "[", ")" if self.below_high else "]"
+            text = f"a {kind} in {left}{self.low:g}, {self.high:g}{right}"
         return f"{text}, or None" if self.optional else text
 
 

@@ -34,8 +34,8 @@ class Context(NamedTuple):
 
     Shapes: observations (B, K, O) as the environment gives them, actions (B, K, A) in [-1, 1], returns_to_go (B, K) in
     environment reward units, timesteps (B, K) int64, mask (B, K) bool, False on padded steps, episode_keys (B,) int64, a
-    hash of the bytes of each episode's first observation, keys_values (B, ...), what the policy keeps of its earlier computation, (B, 0)
-    if nothing.
+    hash of the bytes of each episode's first observation, keys_values (B, ...), what the policy keeps of its earlier
+    computation, (B, 0) if nothing.
     """
 
     observations: np.ndarray

@@ -1,7 +1,7 @@
 """
 What only makes a CPU faster: dropout masks, and products of few rows. Without this file the numbers would be the same.
 
-Measured on 2 cores of an AMD EPYC with AVX2, microseconds, weights that lie outside of the cache; `make bench` shows the whole:
+Measured on 2 cores of an AMD EPYC with AVX2, in microseconds, with weights that lie outside of the cache:
 
 | product | rows | torch | NumPy |
 | --- | --- | --- | --- |
@@ -28,7 +28,7 @@ LARGE_WEIGHT = 1 << 17
 
 
 class Linear(nn.Linear):
-    """torch's linear layer; for few rows of a large weight on a CPU, without gradients, by NumPy's matrix-vector products."""
+    """torch's linear layer; few rows times a large weight on a CPU, without gradients, by NumPy's matrix-vector products."""
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """From (..., in_features) to (..., out_features)."""
