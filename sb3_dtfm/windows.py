@@ -96,7 +96,7 @@ def push(
     keep = ~restart[:, None]
     episode_keys = context.episode_keys.copy()
     for row in np.flatnonzero(restart):
-        episode_keys[row] = zlib.crc32(np.ascontiguousarray(observation[row], np.float32))
+        episode_keys[row] = zlib.crc32(observation[row].astype(np.float32) + 0.0)  # no negative zeros
     return Context(
         _shift(context.observations, observation),
         _shift(context.actions, np.zeros_like(context.actions[:, 0])),

@@ -167,6 +167,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         check_arguments(vars(self), ACCEPTED)
         if not callable(self.learning_rate):
             check_arguments({"learning_rate": self.learning_rate}, {"learning_rate": POSITIVE})
+            self.learning_rate = float(self.learning_rate)  # SB3 refuses NumPy's numbers
         check_batch_size(self.batch_size)
 
     def set_dataset(self, dataset: Dataset) -> None:

@@ -35,10 +35,7 @@ class RememberedContext:
         before, after = self._before, self._after
         if before is None or after is None or len(after.mask) != len(observation):
             return None
-        same_step = timestep == after.timesteps[:, -1]
-        again = same_step & (observation == after.observations[:, -1]).all(axis=1)
-        if (same_step & ~again).any():
-            self.warn(f"Time step {timestep[same_step & ~again][0]} came twice, with two different observations.", 5)
+        again = (timestep == after.timesteps[:, -1]) & (observation == after.observations[:, -1]).all(axis=1)
         if not again.any():
             return after
         return before if again.all() else _choose(again, before, after)
@@ -50,16 +47,11 @@ class RememberedContext:
         """
         self._before, self._after = before, after
 
-    def warn(self, what: str, stacklevel: int = 4) -> None:
-        """
-        Tell once how contexts are kept apart.
-
-        :param what: what was noticed
-        :param stacklevel: how far up the caller of the model's `predict` is
-        """
+    def warn(self, what: str) -> None:
+        """Tell once how contexts are kept apart."""
         if not self._has_warned:
             self._has_warned = True
-            warnings.warn(f"{what} {ADVICE}", UserWarning, stacklevel)
+            warnings.warn(f"{what} {ADVICE}", UserWarning, stacklevel=4)
 
 
 def _choose(rows: np.ndarray, first: Context, second: Context) -> Context:

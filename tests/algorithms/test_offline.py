@@ -136,7 +136,7 @@ def test_a_cache_trains_the_same_model_as_memory(cheetah_buffer, tmp_path):
     def read(storage):
         return TrajectoryBuffer.from_trajectories(episodes, cheetah_buffer.action_space, storage=storage)
 
-    cached = load_cached(tmp_path, Fingerprint("cheetah", "", ""), "cheetah", read)
+    cached = load_cached(tmp_path, Fingerprint("cheetah", "", "", ""), read)
     models = [make_model(DTFM, buffer, dataset_fraction=0.5).learn(5, log_interval=2) for buffer in (cheetah_buffer, cached)]
     assert models[1].buffer.memory_mapped
     assert th.equal(*map(weights, models))

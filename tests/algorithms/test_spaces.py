@@ -150,7 +150,7 @@ def test_an_env_of_another_shape_or_range_is_refused(own_arrays, pendulum_buffer
     model = make_model(DT, pendulum_buffer, env=None if own_arrays else make_pendulum())
     model.save(tmp_path / "model")
     louder = gym.wrappers.RescaleAction(gym.make("Pendulum-v1"), np.float32(-3.0), np.float32(3.0))
-    for env, named in ((make_env(), r"\(3,\).*\(17,\)"), (wrapped(louder), "Box.*2.0.*Box.*3.0")):
+    for env, named in ((make_env(), r"\(17,\).*\(3,\)"), (wrapped(louder), "Box.*3.0.*Box.*2.0")):
         with pytest.raises(ValueError, match=named):
             model.set_env(env)
         with pytest.raises(ValueError, match=named):
