@@ -19,8 +19,8 @@ from tqdm import tqdm
 
 from sb3_dtfm import DTFM
 from sb3_dtfm.benchmark.evaluation import SeededEpisodes, evaluate
+from sb3_dtfm.benchmark.statistics import wilson
 from sb3_dtfm.envs import ReturnToGoWrapper
-from sb3_dtfm.zoo.plots import wilson_interval
 
 # Name: solver, its steps, keys and values kept.
 WAYS = {
@@ -69,7 +69,7 @@ def report(files: list[str]) -> None:
     for (env, way), values in cells.items():
         returns, successes = values["returns"], values["successes"]
         if successes:
-            low, high = wilson_interval(int(sum(successes)), len(successes))
+            _, low, high = wilson(int(sum(successes)), len(successes))
             result = f"{np.mean(successes):.1%} | {low:.1%} to {high:.1%}"
         else:
             result = f"{np.mean(returns):,.0f} | {np.std(returns):,.0f}"

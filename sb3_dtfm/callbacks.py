@@ -24,9 +24,46 @@ class GradientStepProgressBar(ProgressBarCallback):
         return True
 
 
+class EvaluateAtStartAndEnd(BaseCallback):
+    """
+    Evaluate before the first gradient step and after the last one too, where `EvalCallback` counts full intervals only.
+
+    The curve of an evaluation then shows where training started, be it from random weights or from a trained model, and
+    where it ended; no step is evaluated twice. Put it behind the callbacks that evaluate.
+
+    :param eval_callbacks: the evaluations to complete
+    """
+
+    def __init__(self, eval_callbacks: list[EvalCallback]) -> None:
+        super().__init__()
+        self.eval_callbacks = [evaluation for evaluation in eval_callbacks if evaluation.eval_freq > 0]
+        self._evaluated_at: int | None = None
+
+    def _on_training_start(self) -> None:
+        if self._evaluated_at != self.num_timesteps:
+            self._evaluate(self.eval_callbacks)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_training_end(self) -> None:
+        if self._evaluated_at != self.num_timesteps:
+            self._evaluate([evaluation for evaluation in self.eval_callbacks if not self._just_evaluated(evaluation)])
+
+    def _just_evaluated(self, evaluation: EvalCallback) -> bool:
+        return evaluation.num_timesteps == self.num_timesteps and evaluation.n_calls % evaluation.eval_freq == 0
+
+    def _evaluate(self, eval_callbacks: list[EvalCallback]) -> None:
+        for evaluation in eval_callbacks:
+            n_calls, evaluation.n_calls = evaluation.n_calls, -1  # the next call is number 0, on which every interval ends
+            evaluation.on_step()
+            evaluation.n_calls = n_calls
+        self._evaluated_at = self.num_timesteps
+
+
 class NormalizedScoreCallback(BaseCallback):
     """
-    Log `eval/normalized_score` after each evaluation. Put it behind the callbacks that evaluate.
+    Log `eval/normalized_score` after each evaluation, whatever asked for it. Put it behind the callbacks that evaluate.
 
     :param score_reference: the returns that count as 0 and 1
     :param eval_callbacks: the evaluations to follow
@@ -37,6 +74,11 @@ class NormalizedScoreCallback(BaseCallback):
         self.score_reference = score_reference
         self.eval_callbacks = eval_callbacks
 
+    def _init_callback(self) -> None:
+        # `EvalCallback` starts each evaluation with a new list of successes, and tells of it in no other way: what it calls
+        # after an evaluation is left out where the new best model ends the training.
+        self._seen = [evaluation._is_success_buffer for evaluation in self.eval_callbacks]
+
     def _on_training_start(self) -> None:
         if self.eval_callbacks and self.model.verbose >= 1:
             reference = self.score_reference
@@ -44,11 +86,18 @@ class NormalizedScoreCallback(BaseCallback):
                 f"eval/normalized_score: 0 is a return of {reference.minimum:.1f}, 1 is {reference.maximum:.1f} "
                 f"({reference.scale})"
             )
+        self._log_new_evaluations()
 
     def _on_step(self) -> bool:
-        for evaluation in self.eval_callbacks:
-            if evaluation.eval_freq > 0 and evaluation.n_calls % evaluation.eval_freq == 0:
-                score = self.score_reference.normalize(float(evaluation.last_mean_reward))
-                self.logger.record("eval/normalized_score", score)
-                self.logger.dump(self.num_timesteps)
+        self._log_new_evaluations()
         return True
+
+    def _on_training_end(self) -> None:
+        self._log_new_evaluations()
+
+    def _log_new_evaluations(self) -> None:
+        for i, evaluation in enumerate(self.eval_callbacks):
+            if evaluation._is_success_buffer is not self._seen[i]:
+                self._seen[i] = evaluation._is_success_buffer
+                self.logger.record("eval/normalized_score", self.score_reference.normalize(evaluation.last_mean_reward))
+                self.logger.dump(self.num_timesteps)

@@ -12,8 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from sb3_dtfm.zoo.plots import wilson_interval
-
 CONFIDENCE = 0.95
 N_BOOTSTRAP = 2000
 
@@ -38,7 +36,8 @@ def wilson(n_successes: int, n_episodes: int) -> Interval:
     """
     if not 0 <= n_successes <= n_episodes or n_episodes == 0:
         raise ValueError(f"n_successes must lie in [0, n_episodes] and n_episodes be positive: {n_successes}, {n_episodes}.")
-    return Interval(n_successes / n_episodes, *wilson_interval(n_successes, n_episodes))
+    interval = stats.binomtest(n_successes, n_episodes).proportion_ci(CONFIDENCE, method="wilson")
+    return Interval(n_successes / n_episodes, float(interval.low), float(interval.high))
 
 
 def student_t(values: Sequence[float] | np.ndarray) -> Interval:

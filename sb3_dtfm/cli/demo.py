@@ -14,9 +14,10 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_dtfm import DTFM
-from sb3_dtfm.cli import main as cli
+from sb3_dtfm.benchmark.statistics import wilson
+from sb3_dtfm.cli import train
+from sb3_dtfm.cli.plot import plot_learning_curve
 from sb3_dtfm.recording.demonstrations import record_demonstrations
-from sb3_dtfm.zoo.plots import plot_learning_curve, wilson_interval
 
 ENV_ID = "robosuite/Lift-v0"
 ENV_NAME = ENV_ID.replace("/", "-")  # RL-Zoo's spelling in folders
@@ -108,7 +109,7 @@ def train_if_missing(folder: Path, dataset: Path, n_steps: int | None) -> Path:
     if n_steps is not None:
         arguments += ["--n-timesteps", str(n_steps), "--eval-freq", str(min(EVALUATION_INTERVAL, n_steps))]
     print("sb3-dtfm train " + " ".join(arguments))
-    cli.train(arguments)
+    train.main(arguments)
     return _finished_runs(runs)[-1]
 
 
@@ -149,7 +150,7 @@ def evaluate_if_missing(run_folder: Path, n_episodes: int) -> dict[str, Any]:
         "successes": sum(successes),
         "episodes": len(successes),
         "success_rate": sum(successes) / len(successes),
-        "interval": wilson_interval(sum(successes), len(successes)),
+        "interval": wilson(sum(successes), len(successes))[1:],
         "mean_length": sum(lengths) / len(lengths),
         "seed": EVALUATION_SEED,
     }

@@ -48,7 +48,7 @@ def record_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def record(argv: Sequence[str]) -> None:
+def main(argv: Sequence[str]) -> None:
     """
     Run `sb3-dtfm record`.
 

@@ -1,18 +1,15 @@
-"""`torchrun -m sb3_dtfm train`: process 0 does what RL-Zoo does; the others train along and write nothing."""
+"""`torchrun -m sb3_dtfm train`: process 0 does what RL-Zoo does; the others train along, and what they write is not kept."""
 
 import argparse
 import contextlib
 import os
 import signal
+import tempfile
 from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn
 
-import rl_zoo3.train
 import torch as th
 import torch.distributed as dist
-from rl_zoo3.exp_manager import ExperimentManager
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dtfm.distributed import is_first_process
 from sb3_dtfm.zoo.arguments import UsageError
@@ -43,8 +40,8 @@ def joined_processes(arguments: Sequence[str]) -> Iterator[list[str]]:
         yield list(arguments)
     else:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # or process 0 would wait for this one, and could not save
-        with _training_along():
-            yield [argument for argument in arguments if argument != "--track"]
+        with _nothing_to_keep() as folder:
+            yield [*(argument for argument in arguments if argument != "--track"), "--log-folder", folder]
     dist.destroy_process_group()
 
 
@@ -86,31 +83,8 @@ def _interrupt_once(*_: Any) -> NoReturn:
     raise KeyboardInterrupt
 
 
-class TrainAlongManager(ExperimentManager):
-    """RL-Zoo's way to a trained model, without its folder, its files and its callbacks."""
-
-    def create_log_folder(self) -> None:
-        pass
-
-    def create_callbacks(self) -> None:
-        self.callbacks = []
-
-    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
-        return super().create_envs(n_envs, eval_env, no_log=True)
-
-    def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
-        pass
-
-    def save_trained_model(self, model: BaseAlgorithm) -> None:
-        pass
-
-
 @contextlib.contextmanager
-def _training_along() -> Iterator[None]:
-    """RL-Zoo's `train` without a trace: neither files nor prints."""
-    rl_zoo3.train.ExperimentManager = TrainAlongManager  # type: ignore[misc]
-    try:
-        with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
-            yield
-    finally:
-        rl_zoo3.train.ExperimentManager = ExperimentManager  # type: ignore[misc]
+def _nothing_to_keep() -> Iterator[str]:
+    """A folder for files, and a place for prints, that nobody reads."""
+    with tempfile.TemporaryDirectory() as folder, open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+        yield folder

@@ -1,3 +1,3 @@
-from tests.zoo.conftest import minari_folder, workplace
+from tests.recorded import minari_folder, workplace
 
 __all__ = ["minari_folder", "workplace"]

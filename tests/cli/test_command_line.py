@@ -1,12 +1,17 @@
 """Train, enjoy, record and plot through the command line, as a user types them."""
 
+import shutil
+
+import minari
 import numpy as np
 import pytest
 import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_dtfm import DT, DTFM
-from sb3_dtfm.cli.main import main
-from tests.zoo.conftest import DATASET_ID, TINY, tiny_training
+from sb3_dtfm.cli.main import COMMANDS, main
+from sb3_dtfm.zoo.manager import TrainingError
+from tests.recorded import DATASET_ID, TINY, tiny_training
 
 ALGORITHMS = {"dt": DT, "dtfm": DTFM}
 ENJOY = ["--env", "HalfCheetah-v5", "--no-render", "-n", "40"]
@@ -25,7 +30,7 @@ def test_train_writes_what_enjoy_reads(algo, workplace, capsys):
     names = {"HalfCheetah-v5.zip", "best_model.zip", "evaluations.npz", "rl_model_3_steps.zip"}
     assert names <= {path.name for path in run.iterdir()}
     assert {path.name for path in (run / "HalfCheetah-v5").iterdir()} == {"config.yml", "args.yml", "command.txt"}
-    assert np.load(run / "evaluations.npz")["timesteps"].tolist() == [2, 4]
+    assert np.load(run / "evaluations.npz")["timesteps"].tolist() == [0, 2, 4]
     assert ALGORITHMS[algo].load(run / "HalfCheetah-v5.zip").num_timesteps == 4
 
     for choice in ([], ["--load-best", "--exp-id", "1"], ["--load-checkpoint", "3", "-f", str(workplace / "logs")]):
@@ -49,6 +54,30 @@ def test_a_trained_agent_goes_on_training(workplace, capsys):
     assert steps == [4, 8]
 
 
+def test_a_trained_agent_goes_on_training_with_evaluations_on_a_scale_of_scores(workplace, minari_folder, monkeypatch):
+    shutil.copytree(minari_folder, workplace / "scored")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(workplace / "scored"))
+    minari.load_dataset(DATASET_ID).storage.update_metadata({"ref_min_score": -100.0, "ref_max_score": 100.0})
+    settings = ["--conf-file", "small", "--eval-freq", "2", "--eval-episodes", "1", "-tb", "tb"]
+    assert train("dt", *settings) == 0
+    runs = workplace / "logs" / "dt"
+    assert train("dt", *settings, "--trained-agent", str(runs / "HalfCheetah-v5_1" / "HalfCheetah-v5.zip")) == 0
+    logs = [EventAccumulator(str(workplace / "tb" / "HalfCheetah-v5" / f"DT_{n}")).Reload() for n in (1, 2)]
+    scores = [{event.step: event.value for event in log.Scalars("eval/normalized_score")} for log in logs]
+    means = [np.load(runs / f"HalfCheetah-v5_{n}" / "evaluations.npz")["results"][:, 0] for n in (1, 2)]
+    assert [list(score) for score in scores] == [[0, 2, 4], [0, 2, 4]]
+    assert [list(score.values()) for score in scores] == [pytest.approx((mean + 100) / 200) for mean in means]
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_a_callback_of_the_users_own_runs_beside_the_evaluation(algo, workplace):
+    callback = "callback:{'stable_baselines3.common.callbacks.CheckpointCallback':dict(save_freq=3,save_path='mine')}"
+    assert train(algo, "-params", callback, "--conf-file", "small", "--eval-freq", "3", "--eval-episodes", "1") == 0
+    assert [path.name for path in (workplace / "mine").iterdir()] == ["rl_model_3_steps.zip"]
+    run = workplace / "logs" / algo / "HalfCheetah-v5_1"
+    assert np.load(run / "evaluations.npz")["timesteps"].tolist() == [0, 3, 4]
+
+
 def test_a_configuration_file_of_the_users_own_and_an_environment_it_does_not_list(workplace):
     settings = {"default": {"policy": "MultiInputPolicy", "n_timesteps": 2, "context_length": 3}}
     (workplace / "mine.yml").write_text(yaml.safe_dump(settings))
@@ -58,9 +87,11 @@ def test_a_configuration_file_of_the_users_own_and_an_environment_it_does_not_li
 
 
 def test_rl_zoos_own_algorithms_still_train(workplace):
-    arguments = ["--algo", "sac", "--env", "Pendulum-v1", "-n", "20", "--eval-freq", "-1", "-params", "learning_starts:10"]
+    arguments = ["--algo", "sac", "--env", "Pendulum-v1", "-n", "20", "--eval-freq", "15", "-params", "learning_starts:10"]
     assert main(["train", *arguments]) == 0
-    assert (workplace / "logs" / "sac" / "Pendulum-v1_1" / "Pendulum-v1.zip").is_file()
+    run = workplace / "logs" / "sac" / "Pendulum-v1_1"
+    assert (run / "Pendulum-v1.zip").is_file()
+    assert np.load(run / "evaluations.npz")["timesteps"].tolist() == [15], "as RL-Zoo evaluates"
 
 
 def test_hyperparameters_can_be_searched(workplace, capsys):
@@ -94,7 +125,14 @@ def test_hyperparameters_can_be_searched(workplace, capsys):
             "--target-return: needed for Hopper-v5",
         ),
         (tiny_training("dt", "env_wrapper:None", "--dataset", DATASET_ID), "ReturnToGoWrapper"),
-        (["enjoy", "--algo", "dtfm", *ENJOY], "logs/dtfm"),
+        (
+            tiny_training("dtfm", "policy_kwargs:dict(one_step=False,solver='one_step')", "--dataset", DATASET_ID),
+            "solver='one_step' needs a model that was trained with policy_kwargs=dict(one_step=True)",
+        ),
+        (
+            ["enjoy", "--algo", "dtfm", *ENJOY],
+            "The logs/dtfm folder was not found. -f names the folder that train wrote to, --exp-id the run in it.",
+        ),
         (["plot", "nowhere"], "nowhere/evaluations.npz does not exist"),
     ],
 )
@@ -106,18 +144,27 @@ def test_a_mistake_ends_in_one_clear_line(arguments, message, workplace, capsys)
     assert not list(workplace.glob("logs/*/*")), "no folder where `enjoy` would look for a run"
 
 
+def test_enjoy_says_where_it_looked_for_a_model_that_the_run_does_not_have(workplace, capsys):
+    (workplace / "logs" / "dt" / "HalfCheetah-v5_1").mkdir(parents=True)
+    assert main(["enjoy", "--algo", "dt", *ENJOY, "--load-best"]) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.startswith(
+        "sb3-dtfm enjoy: error: No model found for dt on HalfCheetah-v5, path: logs/dt/HalfCheetah-v5_1/"
+    )
+    assert error.endswith("-f names the folder that train wrote to, --exp-id the run in it.")
+
+
 def test_debug_shows_the_traceback(workplace):
     with pytest.raises(FileNotFoundError):
         main(["--debug", "plot", "nowhere"])
 
 
-def test_an_error_in_the_midst_of_training_keeps_its_traceback(workplace, monkeypatch):
-    def fail(*_):
-        raise ValueError("halfway")
-
-    monkeypatch.setattr(DTFM, "_gradient_step", fail)
-    with pytest.raises(ValueError, match="halfway"):
-        train("dtfm", "--conf-file", "small", "--eval-freq", "-1")
+def test_an_error_in_the_midst_of_training_keeps_its_traceback_and_its_run(workplace):
+    callback = "callback:{'stable_baselines3.common.callbacks.CheckpointCallback':dict(save_freq=3,save_path='/proc/none')}"
+    with pytest.raises(TrainingError, match="after 0 timesteps: FileNotFoundError") as error:
+        train("dtfm", "-params", callback, "--conf-file", "small", "--eval-freq", "-1")
+    assert isinstance(error.value.__cause__, FileNotFoundError)
+    assert (workplace / "logs" / "dtfm" / "HalfCheetah-v5_1" / "HalfCheetah-v5" / "config.yml").is_file()
 
 
 @pytest.mark.parametrize(
@@ -151,6 +198,18 @@ def test_help_names_the_additions_and_rl_zoos_options(capsys):
     text = capsys.readouterr().out
     for option in ("--dataset-fraction", "--target-return", "--optimize-hyperparameters", "'small'"):
         assert option in text
+
+
+def test_help_lists_all_commands_and_each_has_a_module(capsys):
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = capsys.readouterr().out
+    for command, description in COMMANDS.items():
+        assert f"  {command:10}{description}" in text
+        with pytest.raises(SystemExit) as exit_:
+            main([command, "--help"])
+        assert exit_.value.code == 0
+        assert f"usage: sb3-dtfm {command}" in capsys.readouterr().out
 
 
 def test_every_algorithm_has_a_tiny_policy():

@@ -13,7 +13,7 @@ import pytest
 
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.cli.main import main
-from tests.zoo.conftest import DATASET_ID, tiny_training
+from tests.recorded import DATASET_ID, tiny_training
 
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "sb3_dtfm"]
 LIMIT = 60  # seconds after which processes that wait for each other are taken as hanging
@@ -40,7 +40,7 @@ def test_process_0_does_what_rl_zoo_does_and_the_other_leaves_no_trace(workplace
     run = workplace / "logs" / "dtfm" / "HalfCheetah-v5_1"
     names = {"HalfCheetah-v5.zip", "best_model.zip", "evaluations.npz", "rl_model_3_steps.zip", "0.monitor.csv"}
     assert {path.name for path in run.iterdir()} == {*names, "HalfCheetah-v5"}
-    assert np.load(run / "evaluations.npz")["timesteps"].tolist() == [2, 4]
+    assert np.load(run / "evaluations.npz")["timesteps"].tolist() == [0, 2, 4]
     assert DTFM.load(run / "HalfCheetah-v5.zip").num_timesteps == 4
     assert len(list((workplace / "tb").rglob("events*"))) == 1
     assert output.count("Saving to") == output.count("Log path") == output.count("Eval num_timesteps=2") == 1

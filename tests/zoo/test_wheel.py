@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.zoo.conftest import DATASET_ID, tiny_training
+from tests.recorded import DATASET_ID, tiny_training
 
 ROOT = Path(__file__).parents[2]
 CONFIGS = {f"sb3_dtfm/zoo_configs/{name}" for name in ("dtfm.yml", "dt.yml", "small/dtfm.yml", "small/dt.yml")}

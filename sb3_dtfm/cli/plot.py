@@ -1,4 +1,4 @@
-"""Learning curves of a run of `sb3-dtfm train`: evaluation and training loss over gradient steps."""
+"""`sb3-dtfm plot`: a run's evaluations and training loss over gradient steps."""
 
 import argparse
 from collections.abc import Sequence
@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.stats import binomtest
+
+from sb3_dtfm.benchmark.statistics import wilson
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,10 +27,21 @@ class Evaluations(NamedTuple):
     successes: np.ndarray | None
 
 
-def wilson_interval(n_successes: int, n_episodes: int) -> tuple[float, float]:
-    """Limits of the 95 % Wilson score interval of a success rate, in [0, 1]."""
-    interval = binomtest(n_successes, n_episodes).proportion_ci(confidence_level=0.95, method="wilson")
-    return float(interval.low), float(interval.high)
+def main(argv: Sequence[str]) -> None:
+    """
+    Run `sb3-dtfm plot`.
+
+    :param argv: its arguments
+    """
+    parser = argparse.ArgumentParser(
+        prog="sb3-dtfm plot", description="Draw evaluation and training loss of one run of `sb3-dtfm train` into a PNG."
+    )
+    parser.add_argument("run_folder", help="e.g. logs/dtfm/robosuite-Lift-v0_1")
+    parser.add_argument("--tensorboard", metavar="FOLDER", help="folder of the run's TensorBoard events, for the loss")
+    parser.add_argument("--output", metavar="FILE", help="learning_curve.png in the run folder by default")
+    options = parser.parse_args(argv)
+    output = options.output or Path(options.run_folder) / "learning_curve.png"
+    print(f"Learning curve: {plot_learning_curve(options.run_folder, output, options.tensorboard)}")
 
 
 def load_evaluations(run_folder: Path | str) -> Evaluations:
@@ -83,10 +95,7 @@ def plot_learning_curve(
         n_panels = 2 if len(loss) else 1
         figure = Figure(figsize=(5.2 * n_panels, 3.9), layout="constrained")
         axes = figure.subplots(1, n_panels, squeeze=False)[0]
-        if evaluations.successes is not None:
-            _draw_success(axes[0], evaluations)
-        else:
-            _draw_return(axes[0], evaluations)
+        _draw_evaluations(axes[0], evaluations)
         if len(loss):
             axes[1].plot(steps, loss, color=COLORS["loss"], linewidth=1.8)
             axes[1].set(ylabel="train/loss", title="training", yscale="log")
@@ -101,37 +110,23 @@ def plot_learning_curve(
     return Path(output)
 
 
-def _draw_success(axis: "Axes", evaluations: Evaluations) -> None:
-    assert evaluations.successes is not None
-    rates = 100 * evaluations.successes.mean(axis=1)
-    n_episodes = evaluations.successes.shape[1]
-    limits = 100 * np.array([wilson_interval(int(row.sum()), n_episodes) for row in evaluations.successes])
-    axis.plot(evaluations.steps, rates, color=COLORS["evaluation"], marker="o", linewidth=1.8)
-    axis.fill_between(evaluations.steps, limits[:, 0], limits[:, 1], color=COLORS["evaluation"], alpha=0.15, linewidth=0)
-    axis.set(ylabel="success rate (%)", ylim=(-2, 102), title=f"evaluation, {n_episodes} episodes, 95 % interval")
-
-
-def _draw_return(axis: "Axes", evaluations: Evaluations) -> None:
-    mean, deviation = evaluations.returns.mean(axis=1), evaluations.returns.std(axis=1)
-    axis.plot(evaluations.steps, mean, color=COLORS["evaluation"], marker="o", linewidth=1.8)
-    axis.fill_between(
-        evaluations.steps, mean - deviation, mean + deviation, color=COLORS["evaluation"], alpha=0.15, linewidth=0
-    )
-    axis.set(ylabel="return", title=f"evaluation, {evaluations.returns.shape[1]} episodes, mean ± std")
-
-
-def main(argv: Sequence[str]) -> None:
-    """
-    Run `sb3-dtfm plot`.
-
-    :param argv: its arguments
-    """
-    parser = argparse.ArgumentParser(
-        prog="sb3-dtfm plot", description="Draw evaluation and training loss of one run of `sb3-dtfm train` into a PNG."
-    )
-    parser.add_argument("run_folder", help="e.g. logs/dtfm/robosuite-Lift-v0_1")
-    parser.add_argument("--tensorboard", metavar="FOLDER", help="folder of the run's TensorBoard events, for the loss")
-    parser.add_argument("--output", metavar="FILE", help="learning_curve.png in the run folder by default")
-    options = parser.parse_args(argv)
-    output = options.output or Path(options.run_folder) / "learning_curve.png"
-    print(f"Learning curve: {plot_learning_curve(options.run_folder, output, options.tensorboard)}")
+def _draw_evaluations(axis: "Axes", evaluations: Evaluations) -> None:
+    """Mean over episodes, with a band that the legend explains."""
+    steps, returns, successes = evaluations
+    if successes is not None:
+        intervals = 100 * np.array([wilson(int(row.sum()), len(row)) for row in successes])
+        means, low, high = intervals.T
+        band = "95 % Wilson interval"
+        axis.set(ylabel="success rate (%)", ylim=(0, 100))
+    else:
+        means, deviations = returns.mean(axis=1), returns.std(axis=1)
+        low, high = means - deviations, means + deviations
+        band = "± standard deviation"
+        axis.set(ylabel="return")
+    n_episodes = returns.shape[1]
+    color = COLORS["evaluation"]
+    # Not clipped, since the first marker lies on the axis, and so does one of 0 % or 100 %.
+    axis.plot(steps, means, color=color, marker="o", linewidth=1.8, clip_on=False, label=f"mean of {n_episodes} episodes")
+    axis.fill_between(steps, low, high, color=color, alpha=0.15, linewidth=0, label=band)
+    axis.legend(frameon=False)
+    axis.set_title("evaluation")

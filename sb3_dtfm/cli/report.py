@@ -1,0 +1,5 @@
+"""`sb3-dtfm report`."""
+
+from sb3_dtfm.benchmark.report import main
+
+__all__ = ["main"]

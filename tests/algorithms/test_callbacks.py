@@ -1,0 +1,107 @@
+"""What is evaluated, when, and what the log says of it."""
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.callbacks import EvalCallback, EveryNTimesteps, StopTrainingOnRewardThreshold
+from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.monitor import Monitor
+
+from sb3_dtfm import DT
+from sb3_dtfm.callbacks import EvaluateAtStartAndEnd
+from sb3_dtfm.data import ScoreReference
+from tests.conftest import TINY_POLICY, make_env
+
+SCORE = "eval/normalized_score"
+
+
+class Records(KVWriter):
+    """A log of (step, value) for each name."""
+
+    def __init__(self) -> None:
+        self.values: dict[str, list[tuple[int, float]]] = {}
+
+    def write(self, key_values, key_excluded, step=0) -> None:
+        for name, value in key_values.items():
+            self.values.setdefault(name, []).append((step, value))
+
+
+@pytest.fixture
+def model(cheetah_buffer, monkeypatch):
+    """Learns from episodes on whose scale a return of -100 is 0 and one of 100 is 1."""
+    monkeypatch.setattr(cheetah_buffer, "score_reference", ScoreReference(-100.0, 100.0, "test scale"))
+    return make_model(cheetah_buffer)
+
+
+def make_model(buffer) -> DT:
+    kwargs = dict(policy_kwargs=dict(TINY_POLICY, dropout=0.1), batch_size=8, context_length=5, seed=1, device="cpu")
+    return DT("MultiInputPolicy", dataset=buffer, **kwargs)
+
+
+def evaluate_every(n_steps: int, **kwargs) -> EvalCallback:
+    return EvalCallback(Monitor(make_env()), eval_freq=n_steps, n_eval_episodes=1, verbose=0, **kwargs)
+
+
+def learn(model: DT, n_steps: int, callback, **kwargs) -> dict[str, list[tuple[int, float]]]:
+    records = Records()
+    model.set_logger(Logger(None, [records]))
+    model.learn(n_steps, callback=callback, **kwargs)
+    return records.values
+
+
+def check_scores(records: dict[str, list[tuple[int, float]]]) -> list[int]:
+    """The steps of the normalised scores, after a look at their values."""
+    assert records[SCORE] == [(step, pytest.approx((mean + 100) / 200)) for step, mean in records["eval/mean_reward"]]
+    return [step for step, _ in records[SCORE]]
+
+
+def test_a_score_is_logged_once_for_each_evaluation_whatever_triggers_it(model):
+    periodic, every = evaluate_every(4), EveryNTimesteps(3, evaluate_every(1))
+    assert check_scores(learn(model, 10, [periodic])) == [4, 8]
+    assert check_scores(learn(model, 10, [every])) == [3, 6, 9]
+    again = learn(model, 4, [periodic], reset_num_timesteps=False)  # calls go on being counted, from ten
+    assert check_scores(again) == [12]
+
+
+def test_the_evaluation_that_ends_training_has_its_score_too(model):
+    stop = StopTrainingOnRewardThreshold(-1e9)
+    assert check_scores(learn(model, 10, evaluate_every(3, callback_on_new_best=stop))) == [3]
+
+
+@pytest.mark.parametrize(("n_steps", "evaluated"), [(10, [0, 4, 8, 10]), (8, [0, 4, 8]), (3, [0, 3]), (0, [0])])
+def test_start_and_end_are_evaluated_and_no_step_twice(n_steps, evaluated, model, tmp_path):
+    evaluation = evaluate_every(4, log_path=str(tmp_path), best_model_save_path=str(tmp_path))
+    records = learn(model, n_steps, [evaluation, EvaluateAtStartAndEnd([evaluation])])
+    assert check_scores(records) == evaluated
+    arrays = np.load(tmp_path / "evaluations.npz")
+    assert arrays["timesteps"].tolist() == evaluated
+    means = [mean for _, mean in records["eval/mean_reward"]]
+    assert arrays["results"].mean(axis=1).tolist() == pytest.approx(means)
+    assert evaluation.best_mean_reward == max(means)
+    assert DT.load(tmp_path / "best_model.zip").num_timesteps == evaluated[int(np.argmax(means))]
+
+
+def test_start_and_end_of_an_evaluation_that_an_event_triggers(model):
+    evaluation = evaluate_every(1)
+    callbacks = [EveryNTimesteps(4, evaluation), EvaluateAtStartAndEnd([evaluation])]
+    assert check_scores(learn(model, 6, callbacks)) == [0, 4, 6]
+
+
+def test_continued_training_goes_on_with_its_intervals(model):
+    evaluation = evaluate_every(4)
+    callbacks = [evaluation, EvaluateAtStartAndEnd([evaluation])]
+    learn(model, 6, callbacks)
+    assert check_scores(learn(model, 6, callbacks, reset_num_timesteps=False)) == [8, 12], "6 was evaluated as the end"
+
+
+def test_what_is_not_to_be_evaluated_is_not(model):
+    evaluation = evaluate_every(-1)
+    assert SCORE not in learn(model, 3, [evaluation, EvaluateAtStartAndEnd([evaluation])])
+
+
+def test_an_evaluation_before_the_first_step_changes_no_weight(cheetah_buffer):
+    evaluation = evaluate_every(100, deterministic=False)
+    plain = make_model(cheetah_buffer).learn(5)
+    evaluated = make_model(cheetah_buffer).learn(5, callback=[evaluation, EvaluateAtStartAndEnd([evaluation])])
+    for name, tensor in plain.policy.state_dict().items():
+        assert th.equal(tensor, evaluated.policy.state_dict()[name]), name
