@@ -1,7 +1,7 @@
 """
 The ways of acting of one trained DTFM on the same initial states: success and return.
 
-    python benchmarks/samplers.py logs/dtfm/robosuite-Can-v0_1/robosuite-Can-v0.zip --env robosuite/Can-v0 --target-return 1
+    python studies/samplers.py logs/dtfm/robosuite-Can-v0_1/robosuite-Can-v0.zip --env robosuite/Can-v0 --target-return 1
 
 Prints one line of JSON for each way; `--report FILES` adds up such lines over models and prints a table with 95 % intervals.
 """

@@ -1,7 +1,7 @@
 """
 Train DTFM at the paper's size on one GPU, as fast as it goes, evaluated by other processes meanwhile.
 
-    python benchmarks/gpu_training.py --dataset local/halfcheetah/expert-v0 --env HalfCheetah-v5 --target-return 12000
+    python studies/gpu_training.py --dataset local/halfcheetah/expert-v0 --env HalfCheetah-v5 --target-return 12000
 
 First measures: no synchronisation inside the loop (one would raise), milliseconds a step, and the share of the GPU's
 peak that matrix products take (model FLOP utilisation). Then trains; a checkpoint every 1,000 steps is evaluated on the
