@@ -33,7 +33,7 @@ def evaluate(checkpoint: str, env_id: str, target_return: float, n_episodes: int
     """Returns of a checkpoint's episodes; runs in a process of its own, on one core."""
     th.set_num_threads(1)
     model = DTFM.load(checkpoint, device="cpu")
-    model.policy.kv_cache = True
+    model.policy.set_acting(kv_cache=True)
     vec_env = make_vec_env(
         env_id, n_episodes, seed, wrapper_class=ReturnToGoWrapper, wrapper_kwargs=dict(target_return=target_return)
     )

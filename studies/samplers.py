@@ -48,8 +48,7 @@ def evaluate_ways(options: argparse.Namespace) -> None:
     noise = model.policy.noise_table.clone()
     for way, deviation in product(options.ways, options.noise_std):
         solver, n_solver_steps, kv_cache = WAYS[way]
-        model.policy.set_solver(solver, n_solver_steps)
-        model.policy.kv_cache = kv_cache
+        model.policy.set_acting(solver=solver, n_solver_steps=n_solver_steps, kv_cache=kv_cache)
         model.policy.noise_table.copy_(deviation * noise)
         with tqdm(total=options.episodes, unit="episode", leave=False, disable=None) as progress:
             episodes = evaluate(model, vec_env, seeds, lambda n_done, bar=progress: bar.update(n_done - bar.n))
