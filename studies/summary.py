@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from sb3_dtfm.benchmark.rows import merge_rows, result_files
-from sb3_dtfm.benchmark.runs import ALGORITHMS, N_LATE, Run, group_runs, steps_to_success
+from sb3_dtfm.benchmark.runs import N_LATE, Run, group_runs, steps_to_success
 
 NONE = "-"
 HORIZON = 1000  # Steps of an episode of MuJoCo's tasks in which nobody falls.
@@ -56,7 +56,7 @@ def lines(folder: Path) -> Iterable[dict[str, str]]:
                 "label": f"`{group.label}`" if group.label else NONE,
                 "task": task,
                 "data": f"{share:.0%}",
-                "algorithm": ALGORITHMS[algo],
+                "algorithm": algo.upper(),
                 "seeds": ", ".join(str(run.cell.seed) for run in runs),
                 **{name: NONE if set(each) == {NONE} else "; ".join(each) for name, each in values.items()},
                 "minutes": f"{np.mean([run.minutes for run in runs]):.1f}",
