@@ -7,7 +7,7 @@ STAMP := $(VENV)/installed
 # d3rlpy needs another gymnasium.
 PEERS := .venv-peers
 # What is checked and formatted besides the package.
-SOURCES := sb3_dtfm envs zoo_configs tests benchmarks
+SOURCES := sb3_dtfm envs zoo_configs tests studies
 
 help:
 	@echo "make install  pinned environment in $(VENV), for Python 3.10 to 3.12"
@@ -52,7 +52,7 @@ test: install
 	$(BIN)/python -m pytest -n 2 --durations=10
 
 bench: install $(PEERS)/installed
-	$(BIN)/python benchmarks/compare.py --peer-python $(PEERS)/bin/python
+	$(BIN)/python studies/compare.py --peer-python $(PEERS)/bin/python
 
 $(PEERS)/installed: constraints.txt
 	rm -rf $(PEERS)

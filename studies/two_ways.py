@@ -4,9 +4,9 @@ Two ways to a goal, equally good: demonstrations with two modes, and where train
 A ball has to get round a block, to the left or to the right. The script that demonstrates it tosses a coin, whatever the
 ball's position, so the same observation is followed by two actions; their mean leads into the block.
 
-    python benchmarks/two_ways.py record
-    sb3-dtfm benchmark $(python benchmarks/two_ways.py arguments) --seeds 0 1 2
-    python benchmarks/two_ways.py plot --dt dt.zip --dtfm dtfm.zip --output docs/two-ways.png
+    python studies/two_ways.py record
+    sb3-dtfm benchmark $(python studies/two_ways.py arguments) --seeds 0 1 2
+    python studies/two_ways.py plot --dt dt.zip --dtfm dtfm.zip --output docs/studies/two-ways.png
 """
 
 import argparse
@@ -115,7 +115,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, help="200 to record, 50 to plot by default")
     parser.add_argument("--dt", type=Path, help="a trained DT")
     parser.add_argument("--dtfm", type=Path, help="a trained DTFM")
-    parser.add_argument("--output", type=Path, default=Path("docs/two-ways.png"))
+    parser.add_argument("--output", type=Path, default=Path("docs/studies/two-ways.png"))
     options = parser.parse_args()
     if options.what == "record":
         record(options.episodes or 200)

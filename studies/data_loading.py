@@ -1,5 +1,5 @@
 """
-Time and memory of loading a Minari dataset: `python benchmarks/data_loading.py`.
+Time and memory of loading a Minari dataset: `python studies/data_loading.py`.
 
 Makes a dataset of noise in a temporary folder, and compares in fresh processes: reading all arrays of every episode with
 h5py, `load_dataset` into memory, and `load_dataset` from a cache that is there already. Prints medians of three runs, the

@@ -1,7 +1,7 @@
 """
 The ways of acting of one trained DTFM on the same initial states: success and return.
 
-    python benchmarks/samplers.py logs/dtfm/robosuite-Can-v0_1/robosuite-Can-v0.zip --env robosuite/Can-v0 --target-return 1
+    python studies/samplers.py logs/dtfm/robosuite-Can-v0_1/robosuite-Can-v0.zip --env robosuite/Can-v0 --target-return 1
 
 Prints one line of JSON for each way; `--report FILES` adds up such lines over models and prints a table with 95 % intervals.
 """
@@ -48,8 +48,7 @@ def evaluate_ways(options: argparse.Namespace) -> None:
     noise = model.policy.noise_table.clone()
     for way, deviation in product(options.ways, options.noise_std):
         solver, n_solver_steps, kv_cache = WAYS[way]
-        model.policy.set_solver(solver, n_solver_steps)
-        model.policy.kv_cache = kv_cache
+        model.policy.set_acting(solver=solver, n_solver_steps=n_solver_steps, kv_cache=kv_cache)
         model.policy.noise_table.copy_(deviation * noise)
         with tqdm(total=options.episodes, unit="episode", leave=False, disable=None) as progress:
             episodes = evaluate(model, vec_env, seeds, lambda n_done, bar=progress: bar.update(n_done - bar.n))

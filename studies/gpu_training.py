@@ -1,7 +1,7 @@
 """
 Train DTFM at the paper's size on one GPU, as fast as it goes, evaluated by other processes meanwhile.
 
-    python benchmarks/gpu_training.py --dataset local/halfcheetah/expert-v0 --env HalfCheetah-v5 --target-return 12000
+    python studies/gpu_training.py --dataset local/halfcheetah/expert-v0 --env HalfCheetah-v5 --target-return 12000
 
 First measures: no synchronisation inside the loop (one would raise), milliseconds a step, and the share of the GPU's
 peak that matrix products take (model FLOP utilisation). Then trains; a checkpoint every 1,000 steps is evaluated on the
@@ -33,7 +33,7 @@ def evaluate(checkpoint: str, env_id: str, target_return: float, n_episodes: int
     """Returns of a checkpoint's episodes; runs in a process of its own, on one core."""
     th.set_num_threads(1)
     model = DTFM.load(checkpoint, device="cpu")
-    model.policy.kv_cache = True
+    model.policy.set_acting(kv_cache=True)
     vec_env = make_vec_env(
         env_id, n_episodes, seed, wrapper_class=ReturnToGoWrapper, wrapper_kwargs=dict(target_return=target_return)
     )

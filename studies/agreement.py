@@ -1,7 +1,7 @@
 """
 How near trained models' actions are to those of the agent that was recorded, had it not drawn them at random.
 
-    python benchmarks/agreement.py Walker2d-v5.zip ... --agent ppo-Walker2d-v5.zip --agent-algo ppo \\
+    python studies/agreement.py Walker2d-v5.zip ... --agent ppo-Walker2d-v5.zip --agent-algo ppo \\
         --dataset local/walker2d/expert-v0 --fraction 0.5
 
 Models are told apart by `/dt/` and `/dtfm/` in their paths, where `sb3-dtfm train` and `benchmark` put them. Prints the root
