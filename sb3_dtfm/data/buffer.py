@@ -15,7 +15,6 @@ from sb3_dtfm.data.trajectories import (
     ScoreReference,
     Trajectory,
     check_action_space,
-    check_observation_space,
     check_trajectory,
     returns_to_go,
 )
@@ -110,7 +109,6 @@ class TrajectoryBuffer:
         for trajectory in trajectories:
             if observation_space is None:
                 observation_space = spaces.Box(-np.inf, np.inf, np.shape(trajectory.observations)[1:], np.float32)
-            check_observation_space(observation_space, source)
             check_trajectory(trajectory, observation_space, action_space, source)
             to_go = returns_to_go(trajectory.rewards)
             storage.append(
@@ -134,6 +132,9 @@ class TrajectoryBuffer:
             score_reference,
             env_id,
         )
+
+    def __repr__(self) -> str:
+        return f"TrajectoryBuffer({self.source}: {self.n_episodes} episodes, {len(self)} steps)"
 
     def __len__(self) -> int:
         """Number of the buffer's own steps."""

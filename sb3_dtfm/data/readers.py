@@ -23,19 +23,20 @@ class Reader(NamedTuple):
     :param kind: what they are, for messages
     :param accepts: whether something is one of them
     :param load: reads one; its other parameters are the options that users have, and `storage`, where the steps go
-    :param fingerprint: what a cache of one is known by, given the dataset and the options for `load`
+    :param fingerprint: what a cache of one is known by, given the dataset and the options for `load`; None for no caches
     """
 
     kind: str
     accepts: Callable[[Any], bool]
     load: Callable[..., TrajectoryBuffer]
-    fingerprint: Callable[[Any, dict[str, Any]], Fingerprint]
+    fingerprint: Callable[[Any, dict[str, Any]], Fingerprint] | None
 
 
 # The first one that accepts a dataset reads it.
 READERS = (
     Reader("the path of a robomimic file (.hdf5)", is_robomimic, load_robomimic, fingerprint_robomimic),
     Reader("a Minari id (namespace/name-vN) or MinariDataset", is_minari, load_minari, fingerprint_minari),
+    Reader("a TrajectoryBuffer", lambda dataset: isinstance(dataset, TrajectoryBuffer), lambda dataset: dataset, None),
 )
 
 
@@ -57,41 +58,30 @@ def load_dataset(
     :raises DatasetError: `dataset` is nothing of the above, its reader refuses it, or its cache cannot be used
     :raises TypeError: the reader has no such option
     """
-    buffer = _load(dataset, cache_dir, kwargs)
-    if env_id is None:
-        return buffer
-    buffer = copy.copy(buffer)
-    buffer.env_id = env_id
-    return buffer
-
-
-def _load(dataset: Any, cache_dir: str | os.PathLike[str] | None, options: dict[str, Any]) -> TrajectoryBuffer:
-    if isinstance(dataset, TrajectoryBuffer):
-        given = options if cache_dir is None else {"cache_dir": cache_dir, **options}
-        _check_options(dataset.source, given, ["env_id"])
-        return dataset
     reader = _find_reader(dataset)
     own = [name for name in inspect.signature(reader.load).parameters if name != "storage"][1:]
-    _check_options(dataset, options, [*own, "cache_dir", "env_id"])
-    if cache_dir is None:
-        return reader.load(dataset, **options)
-    return load_cached(
-        Path(cache_dir).expanduser(),
-        reader.fingerprint(dataset, options),
-        lambda storage: reader.load(dataset, storage=storage, **options),
-    )
+    given = kwargs if cache_dir is None else {**kwargs, "cache_dir": cache_dir}
+    accepted = [*own, *(["cache_dir"] if reader.fingerprint else []), "env_id"]
+    unknown = sorted(set(given) - set(accepted))
+    if unknown:
+        raise TypeError(f"dataset {dataset!s}: unknown option {', '.join(unknown)}; accepted: {', '.join(accepted)}.")
+    if cache_dir is None or reader.fingerprint is None:
+        buffer = reader.load(dataset, **kwargs)
+    else:
+        fingerprint = reader.fingerprint(dataset, kwargs)
+        buffer = load_cached(
+            Path(cache_dir).expanduser(), fingerprint, lambda storage: reader.load(dataset, storage=storage, **kwargs)
+        )
+    if env_id is not None:
+        buffer = copy.copy(buffer)
+        buffer.env_id = env_id
+    return buffer
 
 
 def _find_reader(dataset: Any) -> Reader:
     for reader in READERS:
         if reader.accepts(dataset):
             return reader
-    found = f"{dataset!r}" if isinstance(dataset, str) else f"a {type(dataset).__name__}"
+    found = repr(dataset) if isinstance(dataset, str) else f"a {type(dataset).__name__}"
     kinds = ", ".join(reader.kind for reader in READERS)
-    raise DatasetError(f"dataset is {found}; accepted are {kinds}, or a TrajectoryBuffer.")
-
-
-def _check_options(dataset: Any, given: dict[str, Any], accepted: list[str]) -> None:
-    unknown = sorted(set(given) - set(accepted))
-    if unknown:
-        raise TypeError(f"dataset {dataset!s}: unknown option {', '.join(unknown)}; accepted: {', '.join(accepted)}.")
+    raise DatasetError(f"dataset is {found}; accepted are {kinds}.")

@@ -77,7 +77,9 @@ def load_robomimic(
     path = _existing_file(path)
     source = str(path)
     try:
-        with _open(source) as file:
+        if not h5py.is_hdf5(path):
+            raise DatasetError(f"{source}: not an hdf5 file; a robomimic hdf5 file is expected.")
+        with h5py.File(path, "r") as file:
             return _read(file, source, filter_key, tuple(observation_keys or DEFAULT_OBSERVATION_KEYS), storage)
     except OSError as error:
         raise DatasetError(f"{source}: cannot be read to the end ({error}); is the file cut off?") from error
@@ -89,12 +91,6 @@ def _existing_file(path: str | os.PathLike[str]) -> Path:
         problem = "is a folder" if path.is_dir() else "does not exist"
         raise DatasetError(f"{path.absolute()} {problem}; the path of a robomimic hdf5 file is expected.")
     return path
-
-
-def _open(source: str) -> h5py.File:
-    if not h5py.is_hdf5(source):
-        raise DatasetError(f"{source}: not an hdf5 file; a robomimic hdf5 file is expected.")
-    return h5py.File(source, "r")
 
 
 def _read(

@@ -74,27 +74,18 @@ def check_action_space(space: spaces.Space, source: str) -> spaces.Box:
     :param source: whose it is, for messages
     :raises DatasetError: not a Box of floats of shape (A,), or a dimension without bounds or width
     """
+    problem = f"{source}: the action space is {space}"
     accepted = "only a bounded Box of floats of shape (A,), low < high in each dimension, can be learnt"
-    is_vector = isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating) and len(space.shape) == 1
-    if not is_vector or space.shape == (0,):
-        raise DatasetError(f"{source}: the action space is {space}; {accepted}.")
+    is_vector = len(space.shape or ()) == 1 and space.shape != (0,)
+    if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.floating) or not is_vector:
+        raise DatasetError(f"{problem}; {accepted}.")
     with np.errstate(over="ignore", invalid="ignore"):
         widths = space.high.astype(np.float32) - space.low.astype(np.float32)
-    unfit = np.flatnonzero(~((widths > 0.0) & np.isfinite(widths)))
-    if len(unfit):
-        reach = f"from {space.low[unfit[0]]:g} to {space.high[unfit[0]]:g}"
-        raise DatasetError(f"{source}: the action space is {space}, whose dimension {unfit[0]} reaches {reach}; {accepted}.")
-    return space
-
-
-def check_observation_space(space: spaces.Space, source: str) -> spaces.Box:
-    """
-    The observation space, if it holds vectors of numbers.
-
-    :raises DatasetError: not a Box of shape (O,)
-    """
-    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-        raise DatasetError(f"{source}: the observation space is {space}; only a Box of shape (O,) can be learnt from.")
+    unfit = ~((widths > 0.0) & np.isfinite(widths))
+    if unfit.any():
+        first = int(np.argmax(unfit))
+        reach = f"from {space.low[first]:g} to {space.high[first]:g}"
+        raise DatasetError(f"{problem}, whose dimension {first} reaches {reach}; {accepted}.")
     return space
 
 
@@ -104,6 +95,9 @@ def check_trajectory(trajectory: Trajectory, observation_space: spaces.Box, acti
 
     :raises DatasetError: names source, episode and step, what was found and what is accepted
     """
+    if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
+        found = f"the observation space is {observation_space}"
+        raise DatasetError(f"{source}: {found}; only a Box of shape (O,) can be learnt from.")
     where = f"{source}, {trajectory.name}"
     n_steps = len(trajectory)
     if n_steps == 0:

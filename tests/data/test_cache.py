@@ -292,5 +292,7 @@ def test_a_full_disk_is_no_fault_of_the_dataset(tmp_path: Path):
 
 
 def test_a_buffer_has_no_cache(tmp_path: Path):
-    with pytest.raises(TypeError, match="unknown option cache_dir; accepted: env_id"):
+    with pytest.raises(
+        TypeError, match=r"TrajectoryBuffer\(trajectories: 1 episodes, 2 steps\): unknown option cache_dir; accepted: env_id"
+    ):
         load_dataset(make_buffer([2]), cache_dir=tmp_path)
