@@ -18,7 +18,7 @@ from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory
-from sb3_dtfm.envs.robosuite_scene import TASKS
+from sb3_dtfm.envs.robosuite import env_kwargs_from_robomimic
 
 DEFAULT_OBSERVATION_KEYS = ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos", "object")
 HDF5_SUFFIXES = (".hdf5", ".h5")
@@ -169,9 +169,10 @@ def _env_args(data: h5py.Group, source: str) -> dict[str, Any]:
 
 def _env_id(env_args: dict[str, Any]) -> str | None:
     """Gymnasium id of the file's environment, None where none is registered for it."""
-    tasks = {robosuite_name: task for task, robosuite_name in TASKS.items()}
-    name = env_args.get("env_name")
-    return f"robosuite/{tasks[name]}-v0" if name in tasks else None
+    try:
+        return f"robosuite/{env_kwargs_from_robomimic(env_args)['task']}-v0"
+    except ValueError:
+        return None
 
 
 def _n_steps(demo: h5py.Group, where: str) -> int:
