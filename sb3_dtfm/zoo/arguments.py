@@ -29,16 +29,15 @@ def train_parser() -> argparse.ArgumentParser:
         epilog=f"examples:\n{TRAIN_EXAMPLES}\nRL-Zoo's own options follow.\n",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--dataset", help="dt, dtfm: Minari id or robomimic hdf5 file to learn from")
-    parser.add_argument("--dataset-fraction", type=float, help="dt, dtfm: randomly drawn share of the episodes, in (0, 1]")
-    parser.add_argument(
-        "--dataset-cache", metavar="DIR", help="dt, dtfm: learn from memory-mapped files made in this folder"
-    )
-    parser.add_argument("--target-return", type=float, help="dt, dtfm: return to ask for when acting, in reward units")
-    parser.add_argument(
+    offline = parser.add_argument_group(f"of {' and '.join(OFFLINE_ALGORITHMS)}").add_argument
+    offline("--dataset", help="Minari id or robomimic hdf5 file to learn from")
+    offline("--dataset-fraction", type=float, help="randomly drawn share of the episodes, in (0, 1]")
+    offline("--dataset-cache", metavar="DIR", help="learn from memory-mapped files made in this folder")
+    offline("--target-return", type=float, help="return to ask for when acting, in reward units")
+    offline(
         "-conf",
         "--conf-file",
-        help="dt, dtfm: the packaged settings of the paper if not given, 'small' for those of a 2-core machine; "
+        help="the packaged settings of the paper if not given, 'small' for those of a 2-core machine; "
         "else a YAML file or a Python package, as in RL-Zoo",
     )
     shared = parser.add_argument_group("read on the way to RL-Zoo").add_argument

@@ -57,4 +57,5 @@ class OfflineExperimentManager(ExperimentManager):
         try:
             super().learn(model)
         except Exception as error:
-            raise TrainingError(f"Training ended after {model.num_timesteps} timesteps: {error!r}") from error
+            message = f"Training ended after {model.num_timesteps} timesteps: {type(error).__name__}: {error}"
+            raise TrainingError(message) from error

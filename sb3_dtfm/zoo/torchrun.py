@@ -40,7 +40,7 @@ def joined_processes(arguments: Sequence[str]) -> Iterator[list[str]]:
         yield list(arguments)
     else:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # or process 0 would wait for this one, and could not save
-        with _nothing_to_keep() as folder:
+        with _nothing_to_keep() as folder:  # the last one that is given counts
             yield [*(argument for argument in arguments if argument != "--track"), "--log-folder", folder]
     dist.destroy_process_group()
 
@@ -85,6 +85,6 @@ def _interrupt_once(*_: Any) -> NoReturn:
 
 @contextlib.contextmanager
 def _nothing_to_keep() -> Iterator[str]:
-    """A folder for files, and a place for prints, that nobody reads."""
+    """A folder for files, gone at the end, while prints go nowhere."""
     with tempfile.TemporaryDirectory() as folder, open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
         yield folder

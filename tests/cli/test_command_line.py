@@ -124,6 +124,10 @@ def test_hyperparameters_can_be_searched(workplace, capsys):
             ["train", "--algo", "dtfm", "--env", "Hopper-v5", "--dataset", DATASET_ID],
             "--target-return: needed for Hopper-v5",
         ),
+        (
+            tiny_training("dt", "--dataset", DATASET_ID, "--env", "Walker2d-v5"),
+            "was recorded in HalfCheetah-v5, and the environment is Walker2d-v5",
+        ),
         (tiny_training("dt", "env_wrapper:None", "--dataset", DATASET_ID), "ReturnToGoWrapper"),
         (
             tiny_training("dtfm", "policy_kwargs:dict(one_step=False,solver='one_step')", "--dataset", DATASET_ID),

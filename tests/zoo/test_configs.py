@@ -1,6 +1,7 @@
 """The packaged hyperparameters: every task's model can be built, and DT and DTFM differ in the head only."""
 
 import copy
+import inspect
 
 import gymnasium as gym
 import numpy as np
@@ -11,7 +12,8 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import get_wrapper_class
 
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
-from sb3_dtfm.zoo.registration import OFFLINE_ALGORITHMS, packaged_config, register
+from sb3_dtfm.heads import HEADS
+from sb3_dtfm.zoo.registration import OFFLINE_ALGORITHMS, packaged_config, policy_of, register
 
 TARGETS = {
     "HalfCheetah-v5": 20000,
@@ -21,15 +23,7 @@ TARGETS = {
     "robosuite/Lift-v0": 1,
     "robosuite/Can-v0": 1,
 }
-HEAD_KEYS = {
-    "flow_hidden_dim",
-    "flow_n_layers",
-    "flow_prediction",
-    "flow_tau_exponent",
-    "solver",
-    "n_solver_steps",
-    "one_step",
-}
+HEAD_KEYS = set(HEADS["DTFM"].options())
 SETTINGS = [None, "small"]
 # As the rows in results/ were trained.
 SMALL_STEPS = {
@@ -115,12 +109,14 @@ def test_the_papers_settings():
 def test_a_search_can_find_the_packaged_settings(algo, settings):
     """A trial's `policy_kwargs` replace the YAML's, so what the search leaves out there would be lost."""
     register()
-    unset = {"clip_return_to_go": False, "timestep_embedding": True, "flow_prediction": "velocity", "flow_tau_exponent": 1.0}
+    policy = policy_of(algo)
+    defaults = {name: parameter.default for name, parameter in inspect.signature(policy).parameters.items()}
+    defaults.update(policy.head_class.options())
     for hyperparams in load(algo, settings).values():
         policy_kwargs = copy.copy(hyperparams["policy_kwargs"])
         for key in {"solver", "one_step"} & set(policy_kwargs):  # not searched for: neither changes what the rest learns
             del policy_kwargs[key]
-        packaged = {"ema_decay": 0.0, **hyperparams, **unset, **policy_kwargs}
+        packaged = {"ema_decay": 0.0, **defaults, **hyperparams, **policy_kwargs}
         powers = {f"{key}_pow": int(np.log2(value)) for key, value in packaged.items() if type(value) is int}
         sampled = HYPERPARAMS_SAMPLER[algo](optuna.trial.FixedTrial({**packaged, **powers}), 0, 1, {})
         assert sampled.pop("policy_kwargs").items() >= policy_kwargs.items()

@@ -16,7 +16,7 @@ from sb3_dtfm.cli.main import main
 from tests.recorded import DATASET_ID, tiny_training
 
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "sb3_dtfm"]
-LIMIT = 60  # seconds after which processes that wait for each other are taken as hanging
+LIMIT = 180  # seconds after which processes that wait for each other are taken as hanging
 
 
 def start(*command: str, **kwargs) -> subprocess.Popen:
