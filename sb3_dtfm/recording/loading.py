@@ -48,7 +48,7 @@ def find_agent(model: str | Path, env_id: str) -> AgentFiles:
 
     :param model: zip file, or folder of an RL-Zoo run (`logs/ppo/HalfCheetah-v5_1`), whose last model is taken
     :param env_id: Gymnasium id
-    :raises FileNotFoundError: no agent there, or the run lacks its statistics
+    :raises FileNotFoundError: no agent there
     :raises ImportError: RL-Zoo is needed and not installed
     :raises ValueError: the agent was trained on stacked frames or behind a wrapper of vectorised environments
     """
@@ -81,10 +81,6 @@ def _read_run(model: Path, run: Path) -> AgentFiles:
         arguments = yaml.load((run / "args.yml").read_text(), Loader=yaml.UnsafeLoader)
         env_kwargs = arguments.get("env_kwargs") or env_kwargs  # of the command line, before those of the YAML file
     statistics = run / "vecnormalize.pkl" if hyperparams["normalize"] else None
-    if statistics is not None and not statistics.is_file():
-        raise FileNotFoundError(
-            f"{statistics} does not exist, but config.yml beside it says that observations are normalised."
-        )
     return AgentFiles(model, dict(env_kwargs), get_wrapper_class(hyperparams), statistics)
 
 
@@ -191,7 +187,7 @@ def _shapes(space: spaces.Space) -> Any:
 
 def _load_vec_normalize(path: Path, env: gym.Env) -> VecNormalize:
     if not path.is_file():
-        raise FileNotFoundError(f"{path} does not exist; expected a file that VecNormalize was saved to.")
+        raise FileNotFoundError(f"{path} does not exist; expected a file that the agent's VecNormalize was saved to.")
     try:
         normalizer = VecNormalize.load(str(path), DummyVecEnv([lambda: env]))
     except Exception as error:  # a pickle can raise anything
@@ -212,10 +208,10 @@ def _check_not_normalized(model: BaseAlgorithm, path: Path) -> None:
     if not original or (seen == original and np.dtype(np.float32) not in seen):
         return
     how = f"name its statistics (--vec-normalize FILE) or its RL-Zoo run; --vec-normalize {NOT_NORMALIZED} insists on none."
-    if seen == original and isinstance(model, OffPolicyAlgorithm):
+    if seen in ([], original) and isinstance(model, OffPolicyAlgorithm):
         warnings.warn(f"{path.name} does not tell whether it was trained with VecNormalize: if so, {how}", stacklevel=2)
         return
-    raise ValueError(f"{path.name} was trained with VecNormalize, and nothing makes sense to it without: {how}")
+    raise ValueError(f"{path.name} was trained with VecNormalize, and what it sees means nothing to it without: {how}")
 
 
 def _dtypes(observation: Any) -> list[np.dtype]:

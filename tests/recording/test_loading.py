@@ -105,6 +105,12 @@ def test_arguments_on_the_command_line_are_added_to_those_of_the_run(run: Path):
     assert [len(episode.actions) for episode in dataset] == [7, 7]
 
 
+def test_an_argument_that_is_no_literal_is_refused(run: Path, capsys):
+    with pytest.raises(SystemExit):
+        record(run, "--env-kwargs", "g")
+    assert "'g' is no key:value" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("key", ["frame_stack", "vec_env_wrapper"])
 def test_a_run_that_vectorised_wrappers_belong_to_is_refused(key: str, run: Path, tmp_path: Path, capsys):
     assert record(copy(run, tmp_path / "run", **{key: 4})) == 2
@@ -112,9 +118,14 @@ def test_a_run_that_vectorised_wrappers_belong_to_is_refused(key: str, run: Path
 
 
 def test_a_run_that_lacks_its_statistics_is_refused(run: Path, tmp_path: Path, capsys):
-    (copy(run, tmp_path / "run") / "Pendulum-v1" / "vecnormalize.pkl").unlink()
+    statistics = copy(run, tmp_path / "run") / "Pendulum-v1" / "vecnormalize.pkl"
+    statistics.rename(tmp_path / "elsewhere.pkl")
     assert record(tmp_path / "run") == 2
-    assert "vecnormalize.pkl does not exist, but config.yml" in capsys.readouterr().err
+    assert f"{statistics} does not exist" in capsys.readouterr().err
+    assert (
+        record(tmp_path / "run", "--vec-normalize", str(tmp_path / "elsewhere.pkl"), "--env-kwargs", "max_episode_steps:5")
+        == 0
+    )
 
 
 def test_a_folder_without_the_environments_model_is_refused(run: Path, capsys):
