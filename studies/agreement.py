@@ -17,7 +17,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_dtfm.data import TrajectoryBuffer, load_dataset
-from sb3_dtfm.recording.agent import load_agent
+from sb3_dtfm.recording.loading import load_agent
 from sb3_dtfm.zoo.registration import OFFLINE_ALGORITHMS
 
 N_WINDOWS = 4096

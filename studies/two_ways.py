@@ -23,8 +23,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.benchmark.evaluation import FINAL_STATES
 from sb3_dtfm.envs import ReturnToGoWrapper
-from sb3_dtfm.recording.agent import check_dataset_id, write_dataset
-from sb3_dtfm.recording.episodes import run_episodes
+from sb3_dtfm.recording.agent import episode_seeds
+from sb3_dtfm.recording.episodes import EpisodeRecorder, run_episodes
+from sb3_dtfm.recording.minari import check_dataset_id, write_minari
 
 ENV_ID = "PointMaze_UMaze-v3"
 ENV_KWARGS = {
@@ -65,7 +66,8 @@ def record(n_episodes: int) -> None:
         return np.stack([demonstrators[n].act({k: v[i] for k, v in observations.items()}) for i, n in enumerate(numbers)])
 
     metadata = {"algorithm_name": "way-points, left or right at random"}
-    dataset = write_dataset(DATASET_ID, run_episodes([env], act, n_episodes, seed=0), env, metadata)
+    episodes = run_episodes([EpisodeRecorder(env)], act, episode_seeds(0, n_episodes))
+    dataset = write_minari(DATASET_ID, episodes, env, metadata)
     episodes = list(dataset.iterate_episodes())
     reached = np.mean([episode.terminations[-1] for episode in episodes])
     print(f"{dataset.id}: {n_episodes} episodes, {reached:.0%} reach the goal, {dataset.total_steps} steps")

@@ -1,22 +1,38 @@
-"""Arguments of `sb3-dtfm record`."""
+"""`sb3-dtfm record`: a dataset from a trained agent or a scripted demonstrator."""
 
 import argparse
+import ast
 from collections.abc import Sequence
+from typing import Any
 
-DEMONSTRATORS = ("lift", "can")
+EPILOG = """\
+An agent's files are pickles, and so are VecNormalize's statistics; an RL-Zoo run's YAML files can run code, too. Name those
+that you trust. A run's statistics, environment arguments and wrappers are found whether its folder is named or a zip in it.
 
-EXAMPLES = """\
 examples:
   sb3-dtfm record --algo tqc --model agent.zip --env HalfCheetah-v5 --episodes 100 --dataset-id local/halfcheetah/expert-v0
+  sb3-dtfm record --algo ppo --model logs/ppo/Hopper-v5_1 --env Hopper-v5 --episodes 100 --dataset-id local/hopper/ppo-v0
   sb3-dtfm record --demonstrator lift --episodes 200 --output datasets/lift.hdf5
 """
+
+
+def _keyword(text: str) -> tuple[str, Any]:
+    """An argument as RL-Zoo spells it, `key:value`, with a literal of Python as value."""
+    key, _, value = text.partition(":")
+    try:
+        return key, ast.literal_eval(value)
+    except (SyntaxError, ValueError):
+        raise argparse.ArgumentTypeError(f"{text!r} is no key:value with a number, 'text', list, ... of Python") from None
+
 
 # Options of each way to record: name, whether it must be given, and what argparse gets.
 AGENT_OPTIONS: dict[str, tuple[bool, dict]] = {
     "algo": (True, {"help": "algorithm of the agent, e.g. sac, tqc, ppo"}),
-    "model": (True, {"metavar": "FILE", "help": "the agent's zip file"}),
+    "model": (True, {"metavar": "PATH", "help": "the agent's zip file, or the folder of its RL-Zoo run"}),
     "env": (True, {"metavar": "ENV", "help": "Gymnasium environment id"}),
     "dataset_id": (True, {"metavar": "ID", "help": "Minari id to write, e.g. local/halfcheetah/expert-v0"}),
+    "vec_normalize": (False, {"metavar": "FILE", "help": "the agent's VecNormalize statistics; 'none' insists on none"}),
+    "env_kwargs": (False, {"nargs": "+", "type": _keyword, "metavar": "KEY:VALUE", "help": "of the environment"}),
     "stochastic": (False, {"action": "store_true", "help": "draw actions instead of taking the best"}),
     "n_envs": (False, {"type": int, "metavar": "N", "help": "environments side by side"}),
 }
@@ -27,12 +43,14 @@ DEMONSTRATOR_OPTIONS: dict[str, tuple[bool, dict]] = {
 }
 
 
-def record_parser() -> argparse.ArgumentParser:
+def _parser() -> argparse.ArgumentParser:
     """Arguments of `record`, in one group for each way to record."""
+    from sb3_dtfm.recording.demonstrations import demonstrated_tasks
+
     parser = argparse.ArgumentParser(
         prog="sb3-dtfm record",
         description="Record episodes of a trained agent into Minari, or of a scripted demonstrator into a robomimic file.",
-        epilog=EXAMPLES,
+        epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--episodes", type=int, required=True, metavar="N", help="episodes to keep")
@@ -41,7 +59,7 @@ def record_parser() -> argparse.ArgumentParser:
     parser.add_argument("--overwrite", action="store_true", help="replace a dataset that is there already")
     agent = parser.add_argument_group("a trained agent")
     demonstrator = parser.add_argument_group("a scripted demonstrator")
-    demonstrator.add_argument("--demonstrator", choices=DEMONSTRATORS, help="robosuite task to demonstrate")
+    demonstrator.add_argument("--demonstrator", choices=demonstrated_tasks(), help="robosuite task to demonstrate")
     for group, options in ((agent, AGENT_OPTIONS), (demonstrator, DEMONSTRATOR_OPTIONS)):
         for name, (_, settings) in options.items():
             group.add_argument(_flag(name), default=None, **settings)
@@ -54,7 +72,7 @@ def main(argv: Sequence[str]) -> None:
 
     :param argv: its arguments
     """
-    parser = record_parser()
+    parser = _parser()
     options = parser.parse_args(argv)
     if options.episodes < 1:
         parser.error(f"argument --episodes: must be at least 1, got {options.episodes}")
@@ -80,6 +98,8 @@ def _record_agent(options: argparse.Namespace) -> None:
         noise=options.noise,
         seed=options.seed,
         overwrite=options.overwrite,
+        vec_normalize_path=options.vec_normalize,
+        env_kwargs=dict(options.env_kwargs or []),
         **optional,
     )
     print(f"Recorded {dataset.total_episodes} episodes, {dataset.total_steps} steps: {dataset.id}")

@@ -1,13 +1,10 @@
-"""robomimic's hdf5 files: read into a `TrajectoryBuffer`, and written in the layout of robomimic 1.5."""
+"""Reading robomimic's hdf5 files into a `TrajectoryBuffer`."""
 
 import json
 import os
 import re
-import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import h5py
@@ -23,7 +20,6 @@ from sb3_dtfm.envs.robosuite import env_kwargs_from_robomimic
 DEFAULT_OBSERVATION_KEYS = ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos", "object")
 HDF5_SUFFIXES = (".hdf5", ".h5")
 ALIASES = {"object": "object-state", "object-state": "object"}  # robomimic's name and robosuite's
-VALIDATION_SHARE = 0.1
 OLD_LAYOUT_TOLERANCE = 1e-3  # metres
 
 
@@ -284,107 +280,3 @@ def _action_space(env_args: dict[str, Any], n_actions: int, source: str) -> spac
     low, high = -np.ones(n_actions, np.float32), np.ones(n_actions, np.float32)
     low[: n_actions - 1], high[: n_actions - 1] = arm.get("input_min", -1.0), arm.get("input_max", 1.0)
     return spaces.Box(low, high, dtype=np.float32)
-
-
-@dataclass(frozen=True)
-class RecordedEpisode:
-    """
-    One episode for :class:`RobomimicWriter`.
-
-    :param observations: (T + 1, d) for each observation key
-    :param actions: (T, A)
-    :param rewards: (T,), environment reward units
-    :param states: (T, S) simulator state before each action
-    :param model_file: XML of the simulated scene
-    """
-
-    observations: dict[str, np.ndarray]
-    actions: np.ndarray
-    rewards: np.ndarray
-    states: np.ndarray
-    model_file: str
-
-
-class RobomimicWriter:
-    """
-    Writes one file in robomimic's layout, which appears under its name only when complete.
-
-    Use it as a context manager; if the block fails, nothing is left behind. Filter keys `train`, `valid` (a tenth) and
-    `50_percent` are drawn from `seed`.
-
-    :param path: the file; its folder is made if necessary
-    :param env_args: description of the environment, stored as JSON
-    :param overwrite: replace an existing file
-    :param seed: of the filter keys
-    :raises FileExistsError: the file exists and is not to be overwritten
-    """
-
-    def __init__(
-        self, path: str | os.PathLike[str], env_args: dict[str, Any], overwrite: bool = False, seed: int = 0
-    ) -> None:
-        self.path = Path(path)
-        self._env_args = env_args
-        self._seed = seed
-        self._n_episodes = 0
-        self._n_steps = 0
-        refuse_existing(self.path, overwrite)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-
-    def __enter__(self) -> "RobomimicWriter":
-        handle, name = tempfile.mkstemp(dir=self.path.parent, prefix=f".{self.path.name}.", suffix=".part")
-        os.close(handle)
-        self._temporary = Path(name)
-        self._file = h5py.File(self._temporary, "w")
-        self._data = self._file.create_group("data")
-        return self
-
-    def add(self, episode: RecordedEpisode) -> None:
-        """Append an episode as the next `demo_<i>`."""
-        demo = self._data.create_group(f"demo_{self._n_episodes}")
-        n_steps = len(episode.actions)
-        dones = np.zeros(n_steps, np.int64)
-        dones[-1] = 1
-        for key, values in episode.observations.items():
-            demo[f"obs/{key}"] = values[:-1]
-            demo[f"next_obs/{key}"] = values[1:]
-        demo["actions"] = episode.actions
-        demo["rewards"] = episode.rewards
-        demo["dones"] = dones
-        demo["states"] = episode.states
-        demo.attrs["num_samples"] = n_steps
-        demo.attrs["model_file"] = episode.model_file
-        self._n_episodes += 1
-        self._n_steps += n_steps
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        try:
-            if kind is None:
-                self._finish()
-        finally:
-            self._file.close()
-            self._temporary.unlink(missing_ok=True)
-
-    def _finish(self) -> None:
-        self._data.attrs["total"] = self._n_steps
-        self._data.attrs["env_args"] = json.dumps(self._env_args, indent=4)
-        order = np.random.default_rng(self._seed).permutation(self._n_episodes)
-        n_valid = round(VALIDATION_SHARE * self._n_episodes)
-        masks = {"train": order[n_valid:], "valid": order[:n_valid], "50_percent": order[: (self._n_episodes + 1) // 2]}
-        for key, episodes in masks.items():
-            names = [f"demo_{episode}" for episode in np.sort(episodes)]
-            self._file[f"mask/{key}"] = np.array(names, dtype="S")
-        self._file.close()
-        mask = os.umask(0)
-        os.umask(mask)
-        self._temporary.chmod(0o666 & ~mask)  # a temporary file is private to its owner, an ordinary one is not
-        os.replace(self._temporary, self.path)
-
-
-def refuse_existing(path: Path, overwrite: bool) -> None:
-    """
-    :raises FileExistsError: `path` exists and is not to be overwritten, or is a folder
-    """
-    if path.is_dir():
-        raise FileExistsError(f"{path} is a folder; the path of a file is expected.")
-    if path.exists() and not overwrite:
-        raise FileExistsError(f"{path} exists already; pass overwrite=True (--overwrite) to replace it.")

@@ -1,29 +1,46 @@
-"""Records scripted demonstrations of robosuite tasks into a robomimic hdf5 file."""
+"""Recording scripted demonstrations of robosuite tasks into a robomimic hdf5 file."""
 
+import functools
 import multiprocessing
 import os
 import sys
 import time
-from collections import deque
-from collections.abc import Callable, Generator
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from tqdm import tqdm
 
-from sb3_dtfm.data.robomimic import DEFAULT_OBSERVATION_KEYS, RecordedEpisode, RobomimicWriter, refuse_existing
-from sb3_dtfm.envs.demonstrators import DEMONSTRATORS
+from sb3_dtfm.data.robomimic import DEFAULT_OBSERVATION_KEYS
+from sb3_dtfm.envs.demonstrators import DEMONSTRATORS, Demonstrator
 from sb3_dtfm.envs.robosuite import RobosuiteEnv
-from sb3_dtfm.recording.episodes import check_recording
+from sb3_dtfm.recording.episodes import EpisodeRecorder, RecordedEpisode, add_noise, check_recording, run_episodes
+from sb3_dtfm.recording.robomimic import refuse_existing, write_robomimic
 
-TASKS = {"lift": "Lift", "can": "Can"}
 ROBOT_COLUMNS = (3, 4, 2)  # widths of the observation keys before the object's
 ATTEMPTS_PER_EPISODE = 5  # a demonstrator that fails more often than this is broken
+
+
+class DemonstratedTask(NamedTuple):
+    """
+    A task of :class:`~sb3_dtfm.envs.robosuite.RobosuiteEnv` that a script can do.
+
+    :param name: the environment's name for it
+    :param demonstrator: makes the script from a seed and a mean pause in steps
+    """
+
+    name: str
+    demonstrator: Callable[[int, float], Demonstrator]
+
+
+def demonstrated_tasks() -> dict[str, DemonstratedTask]:
+    """All of them, by their name in lower case."""
+    return {name.lower(): DemonstratedTask(name, demonstrator) for name, demonstrator in DEMONSTRATORS.items()}
 
 
 class RecordingSummary(NamedTuple):
@@ -71,7 +88,7 @@ def record_demonstrations(
     The file depends on the task, the number of episodes, seed, noise and pause only: attempt i draws everything from
     (seed, i), and the first successes in the order of attempts are kept, whatever the number of workers.
 
-    :param task: "lift" or "can"
+    :param task: one of :func:`demonstrated_tasks`
     :param n_episodes: successful episodes to record
     :param output: the hdf5 file; it appears under this name when it is complete
     :param seed: of starts and demonstrators
@@ -83,37 +100,38 @@ def record_demonstrations(
     :param pause: steps that the hand rests before it closes, on average and after a first one; geometrically distributed,
         and 0 closes at once
     :raises FileExistsError: `output` exists and is not to be overwritten
+    :raises RuntimeError: fewer than one attempt in 5 succeeds
+    :raises ValueError: unknown task, or numbers out of range
     """
-    if task not in TASKS:
-        raise ValueError(f"task must be one of {', '.join(map(repr, TASKS))}, got {task!r}.")
+    if task not in demonstrated_tasks():
+        raise ValueError(f"task must be one of {', '.join(map(repr, demonstrated_tasks()))}, got {task!r}.")
     check_recording(n_episodes, noise)
     if not 0.0 <= pause < np.inf:
         raise ValueError(f"pause must be a number of steps, 0 or more, got {pause}.")
     refuse_existing(Path(output), overwrite)
     start = time.monotonic()
     n_workers = min(n_workers or _n_cores(), n_episodes)
-    env = _environment(task)
+    env_args = _environment(task).unwrapped.env_args  # before the workers fork, which then have the compiled scene too
+    attempt = functools.partial(_attempt, task, seed, noise, pause)
+    limit = n_episodes * ATTEMPTS_PER_EPISODE + 10
     lengths: list[int] = []
     n_attempts = 0
-    limit = n_episodes * ATTEMPTS_PER_EPISODE + 10
-    with (
-        RobomimicWriter(output, env.env_args, overwrite, seed) as writer,
-        closing(_attempts(partial(_attempt, task, seed, noise, pause), n_workers, limit)) as attempts,
-    ):
+
+    def successes(attempts: Iterable[RecordedEpisode]) -> Iterator[RecordedEpisode]:
+        nonlocal n_attempts
         with tqdm(total=n_episodes, desc=f"Recording {task}", unit="episode", disable=not progress) as bar:
-            for episode in attempts:
-                n_attempts += 1
-                if episode is not None:
-                    writer.add(episode)
+            for n_attempts, episode in enumerate(attempts, start=1):
+                if episode.terminated:
                     lengths.append(len(episode.actions))
+                    yield episode
                 bar.set_postfix(success=f"{100 * len(lengths) / n_attempts:.0f}%", refresh=False)
-                bar.update(episode is not None)
+                bar.update(episode.terminated)
                 if len(lengths) == n_episodes:
-                    break
-        if len(lengths) < n_episodes:
-            raise RuntimeError(
-                f"Only {len(lengths)} of {n_attempts} demonstrations of {task} succeeded; nothing is written."
-            )
+                    return
+        raise RuntimeError(f"Only {len(lengths)} of {n_attempts} demonstrations of {task} succeeded; nothing is written.")
+
+    with closing(_run(attempt, n_workers, limit)) as attempts:
+        write_robomimic(output, successes(attempts), env_args, seed)
     return RecordingSummary(Path(output), n_episodes, n_attempts, float(np.mean(lengths)), time.monotonic() - start)
 
 
@@ -121,63 +139,40 @@ def _n_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _attempts(
-    attempt: Callable[[int], RecordedEpisode | None], n_workers: int, limit: int
-) -> Generator[RecordedEpisode | None, None, None]:
-    """Episodes in the order of attempts, None for a failed one."""
+def _run(attempt: Callable[[int], RecordedEpisode], n_workers: int, limit: int) -> Generator[RecordedEpisode, None, None]:
+    """Episodes in the order of attempts."""
     if n_workers == 1:
         yield from map(attempt, range(limit))
         return
     # Linux forks: the workers then share what is imported already, and scripts need no __main__ guard.
-    context = multiprocessing.get_context("fork" if sys.platform == "linux" else None)
-    executor = ProcessPoolExecutor(n_workers, mp_context=context)
-    pending: deque[Future[RecordedEpisode | None]] = deque()
+    executor = ProcessPoolExecutor(n_workers, multiprocessing.get_context("fork" if sys.platform == "linux" else None))
     try:
-        for number in range(limit):
-            pending.append(executor.submit(attempt, number))
-            if len(pending) > 2 * n_workers:
-                yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()
+        yield from executor.map(attempt, range(limit))
     finally:
         executor.shutdown(cancel_futures=True)
 
 
-_environments: dict[str, RobosuiteEnv] = {}  # one of each task per process: compiling the scene takes longer than an episode
+@functools.cache
+def _environment(task: str) -> EpisodeRecorder:
+    """One of each task per process: compiling the scene takes longer than an episode."""
+    return EpisodeRecorder(RobosuiteEnv(demonstrated_tasks()[task].name), simulation=True)
 
 
-def _environment(task: str) -> RobosuiteEnv:
-    if task not in _environments:
-        _environments[task] = RobosuiteEnv(TASKS[task])
-    return _environments[task]
-
-
-def _attempt(task: str, seed: int, noise: float, pause: float, attempt: int) -> RecordedEpisode | None:
-    """One episode, None if it does not succeed."""
+def _attempt(task: str, seed: int, noise: float, pause: float, number: int) -> RecordedEpisode:
+    """One episode, which has succeeded if it is terminated."""
     env = _environment(task)
-    env_seed, demonstrator_seed, noise_seed = np.random.SeedSequence((seed, attempt)).generate_state(3)
-    space, noise_rng = env.action_space, np.random.default_rng(int(noise_seed))
-    assert isinstance(space, spaces.Box)
-    scale = noise * (space.high - space.low)
-    demonstrator = DEMONSTRATORS[TASKS[task]](int(demonstrator_seed), pause)
-    observation, _ = env.reset(seed=int(env_seed))
-    observations, actions, states = [observation], [], []
-    terminated = truncated = False
-    while not (terminated or truncated):
-        action = demonstrator.act(observation) + scale * noise_rng.standard_normal(space.shape)
-        actions.append(np.clip(action, space.low, space.high).astype(space.dtype))
-        states.append(env.state)
-        observation, _, terminated, truncated, _ = env.step(actions[-1])
-        observations.append(observation)
-    if not terminated:
-        return None
-    columns = np.split(np.stack(observations), np.cumsum(ROBOT_COLUMNS), axis=1)
-    rewards = np.zeros(len(actions))
-    rewards[-1] = 1.0
-    return RecordedEpisode(
-        observations=dict(zip(DEFAULT_OBSERVATION_KEYS, columns, strict=True)),
-        actions=np.stack(actions),
-        rewards=rewards,
-        states=np.stack(states),
-        model_file=env.model_file,
-    )
+    env_seed, demonstrator_seed, noise_seed = map(int, np.random.SeedSequence((seed, number)).generate_state(3))
+    demonstrator = demonstrated_tasks()[task].demonstrator(demonstrator_seed, pause)
+
+    def act(observations: np.ndarray, starts: np.ndarray, numbers: Sequence[int]) -> np.ndarray:
+        return demonstrator.act(observations[0])[None]
+
+    assert isinstance(env.action_space, spaces.Box)
+    noisy = add_noise(act, env.action_space, noise, lambda _: np.random.default_rng(noise_seed))
+    episode = next(run_episodes([env], noisy, [env_seed]))
+    return replace(episode, observations=[_by_key(observation) for observation in episode.observations])
+
+
+def _by_key(observation: np.ndarray) -> dict[str, Any]:
+    """An observation (O,) as robomimic stores it."""
+    return dict(zip(DEFAULT_OBSERVATION_KEYS, np.split(observation, np.cumsum(ROBOT_COLUMNS)), strict=True))

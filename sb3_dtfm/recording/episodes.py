@@ -1,17 +1,17 @@
-"""Running episodes side by side and keeping what happened in them."""
+"""One episode loop for agents and demonstrators, and what it keeps of an episode."""
 
 import copy
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from minari.data_collector import EpisodeBuffer
-from tqdm import tqdm
+from gymnasium import spaces
 
 # (batched observations, episode starts (n_envs,), episode numbers (n_envs,)) -> actions (n_envs, A)
-ActFunction = Callable[[Any, np.ndarray, list[int]], np.ndarray]
+ActFunction = Callable[[Any, np.ndarray, Sequence[int]], np.ndarray]
 
 
 @dataclass
@@ -20,36 +20,121 @@ class RecordedEpisode:
     One episode while it runs and when it is complete.
 
     :param seed: what the environment was reset with
-    :param observations: T + 1 entries
+    :param observations: T + 1 arrays, or dicts of arrays
     :param actions: T arrays (A,)
-    :param rewards: (T,) float64, environment reward units
+    :param rewards: T numbers, environment reward units
     :param terminated: ended in a terminal state
     :param truncated: ended at a time limit
+    :param states: T arrays (S,), the simulator's state before each action; empty unless asked for
+    :param model_file: XML of the simulated scene; empty unless asked for
     """
 
-    seed: int
+    seed: int | None
     observations: list[Any]
     actions: list[np.ndarray] = field(default_factory=list)
-    reward_list: list[float] = field(default_factory=list)
+    rewards: list[float] = field(default_factory=list)
     terminated: bool = False
     truncated: bool = False
+    states: list[np.ndarray] = field(default_factory=list)
+    model_file: str = ""
 
-    @property
-    def rewards(self) -> np.ndarray:
-        return np.asarray(self.reward_list, dtype=np.float64)
 
-    def to_buffer(self) -> EpisodeBuffer:
-        n_steps = len(self.actions)
-        ends = np.zeros((2, n_steps), dtype=bool)
-        ends[:, -1] = self.terminated, self.truncated
-        return EpisodeBuffer(
-            seed=self.seed,
-            observations=stack_observations(self.observations),
-            actions=np.stack(self.actions),
-            rewards=self.rewards,
-            terminations=ends[0],
-            truncations=ends[1],
-        )
+class EpisodeRecorder(gym.Wrapper):
+    """
+    Keeps what passes through an environment.
+
+    Other wrappers stand around it, so that what is kept is what the environment itself gave and was given.
+
+    :param env: the environment
+    :param simulation: keep the simulator's states and scene too, which `env.unwrapped` has as `state` and `model_file`
+    """
+
+    recorded: RecordedEpisode
+
+    def __init__(self, env: gym.Env, simulation: bool = False) -> None:
+        super().__init__(env)
+        self._simulator: Any = env.unwrapped if simulation else None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        observation, info = self.env.reset(seed=seed, options=options)
+        # An environment may hand out the same array at every step.
+        self.recorded = RecordedEpisode(seed, [copy.deepcopy(observation)])
+        if self._simulator is not None:
+            self.recorded.model_file = self._simulator.model_file
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        episode, action = self.recorded, np.asarray(action, self.action_space.dtype)
+        if self._simulator is not None:
+            episode.states.append(self._simulator.state)
+        episode.actions.append(action.copy())
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        episode.observations.append(copy.deepcopy(observation))
+        episode.rewards.append(float(reward))
+        episode.terminated, episode.truncated = bool(terminated), bool(truncated)
+        return observation, reward, terminated, truncated, info
+
+
+def run_episodes(envs: Sequence[gym.Env], act: ActFunction, seeds: Sequence[int]) -> Iterator[RecordedEpisode]:
+    """
+    One episode for each seed, in their order, run side by side.
+
+    An environment that finishes takes the next episode. Once none is left it stands still, and its row of the batch is
+    ignored, so that an agent with memory sees the same rows throughout. An episode that a wrapper ends, and not the
+    environment itself, is truncated.
+
+    :param envs: environments of one kind, with an :class:`EpisodeRecorder` among their wrappers
+    :param act: chooses the actions
+    :param seeds: what the environments are reset with
+    """
+    envs = envs[: len(seeds)]
+    numbers = list(range(len(envs)))
+    observations = [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=False)]
+    starts, active = np.ones((2, len(envs)), dtype=bool)
+    waiting = iter(range(len(envs), len(seeds)))
+    finished: dict[int, RecordedEpisode] = {}
+    n_yielded = 0
+    while active.any():
+        actions = act(stack_observations(observations), starts, numbers)
+        starts[:] = False
+        for row in np.flatnonzero(active):
+            observations[row], _, terminated, truncated, _ = envs[row].step(actions[row])
+            if not (terminated or truncated):
+                continue
+            finished[numbers[row]] = episode = envs[row].get_wrapper_attr("recorded")
+            episode.truncated |= not episode.terminated
+            number = next(waiting, None)
+            if number is None:
+                active[row] = False
+                continue
+            observations[row], _ = envs[row].reset(seed=seeds[number])
+            numbers[row], starts[row] = number, True
+        while n_yielded in finished:
+            yield finished.pop(n_yielded)
+            n_yielded += 1
+
+
+def add_noise(
+    act: ActFunction, space: spaces.Box, noise: float, generator: Callable[[int], np.random.Generator]
+) -> ActFunction:
+    """
+    The same actions with Gaussian noise, clipped into the action space.
+
+    :param act: chooses the actions
+    :param space: the action space
+    :param noise: standard deviation, as a share of the action range (high - low)
+    :param generator: makes the source of an episode's noise from the episode's number
+    """
+    generator = functools.cache(generator)
+    scale = noise * (space.high - space.low)
+
+    def act_with_noise(observations: Any, starts: np.ndarray, numbers: Sequence[int]) -> np.ndarray:
+        actions = act(observations, starts, numbers)
+        if noise > 0.0:
+            actions = actions + scale * np.stack([generator(number).standard_normal(space.shape) for number in numbers])
+        return np.clip(actions, space.low, space.high).astype(space.dtype)
+
+    return act_with_noise
 
 
 def check_recording(n_episodes: int, noise: float) -> None:
@@ -67,71 +152,7 @@ def check_recording(n_episodes: int, noise: float) -> None:
 
 
 def stack_observations(observations: Sequence[Any]) -> Any:
+    """One array, or dict of arrays, of several observations."""
     if isinstance(observations[0], dict):
         return {key: np.stack([observation[key] for observation in observations]) for key in observations[0]}
     return np.stack(observations)
-
-
-def run_episodes(envs: Sequence[gym.Env], act: ActFunction, n_episodes: int, seed: int) -> Iterator[RecordedEpisode]:
-    """
-    Episodes 0 to n - 1 in their order, run side by side.
-
-    An environment that finishes takes the next episode. Once none is left it stands still, and its row of the batch is
-    ignored, so that an agent with memory sees the same rows throughout.
-
-    :param envs: environments of one kind
-    :param act: chooses the actions
-    :param n_episodes: n
-    :param seed: seed that the episodes' seeds are drawn from
-    """
-    seeds = [int(number) for number in np.random.default_rng(seed).integers(2**31, size=n_episodes)]
-    n_rows = min(len(envs), n_episodes)
-    numbers = list(range(n_rows))
-    running = [start(envs[row], seeds[row]) for row in range(n_rows)]
-    starts = np.ones(n_rows, dtype=bool)
-    active = np.ones(n_rows, dtype=bool)
-    finished: dict[int, RecordedEpisode] = {}
-    n_started, n_yielded = n_rows, 0
-    while active.any():
-        actions = act(stack_observations([episode.observations[-1] for episode in running]), starts, numbers)
-        starts[:] = False
-        for row in np.flatnonzero(active):
-            if not step(envs[row], running[row], actions[row]):
-                continue
-            finished[numbers[row]] = running[row]
-            if n_started == n_episodes:
-                active[row] = False
-                continue
-            running[row] = start(envs[row], seeds[n_started])
-            numbers[row], starts[row] = n_started, True
-            n_started += 1
-        while n_yielded in finished:
-            yield finished.pop(n_yielded)
-            n_yielded += 1
-
-
-def start(env: gym.Env, seed: int) -> RecordedEpisode:
-    """Reset the environment and record its first observation."""
-    return RecordedEpisode(seed, [copy.deepcopy(env.reset(seed=seed)[0])])
-
-
-def step(env: gym.Env, episode: RecordedEpisode, action: np.ndarray) -> bool:
-    """Execute and record one action. True if the episode is over."""
-    episode.actions.append(action.copy())
-    observation, reward, terminated, truncated, _ = env.step(action)
-    # An environment may hand out the same array at every step.
-    episode.observations.append(copy.deepcopy(observation))
-    episode.reward_list.append(float(reward))
-    episode.terminated, episode.truncated = bool(terminated), bool(truncated)
-    return episode.terminated or episode.truncated
-
-
-def show_progress(episodes: Iterator[RecordedEpisode], n_episodes: int, progress: bool) -> Iterator[RecordedEpisode]:
-    """Pass episodes on under a progress bar with their mean return."""
-    total_return = 0.0
-    with tqdm(total=n_episodes, unit="episode", disable=not progress) as bar:
-        for number, episode in enumerate(episodes, start=1):
-            total_return += episode.rewards.sum()
-            bar.set_postfix(mean_return=f"{total_return / number:.1f}", refresh=False)
-            bar.update()
-            yield episode

@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 import pytest
 
-from sb3_dtfm.data.robomimic import RecordedEpisode, RobomimicWriter, load_robomimic
+from sb3_dtfm.data.robomimic import load_robomimic
 from sb3_dtfm.data.trajectories import DatasetError
 
 ROBOT = {"robot0_eef_pos": 3, "robot0_eef_quat": 4, "robot0_gripper_qpos": 2}
@@ -334,70 +334,3 @@ def test_broken_env_args_are_named(path):
     with h5py.File(path, "a") as file:
         file["data"].attrs["env_args"] = "{"
     assert "'env_args' of group 'data' is not JSON" in refused(path)
-
-
-def make_episode(n_steps, seed=0):
-    rng = np.random.default_rng(seed)
-    rewards = np.zeros(n_steps)
-    rewards[-1] = 1.0
-    observations = {key: rng.normal(size=(n_steps + 1, width)) for key, width in {**ROBOT, "object": 10}.items()}
-    return RecordedEpisode(
-        observations, rng.uniform(-1, 1, (n_steps, 7)), rewards, rng.normal(size=(n_steps, 32)), "<mujoco/>"
-    )
-
-
-def test_written_file_has_robomimics_layout_and_reads_back(path):
-    episodes = [make_episode(4 + i, seed=i) for i in range(20)]
-    with RobomimicWriter(path, env_args()) as writer:
-        for episode in episodes:
-            writer.add(episode)
-    with h5py.File(path) as file:
-        data = file["data"]
-        assert data.attrs["total"] == sum(len(episode.actions) for episode in episodes)
-        assert json.loads(data.attrs["env_args"]) == env_args()
-        demo = data["demo_3"]
-        assert demo.attrs["num_samples"] == 7
-        assert demo.attrs["model_file"] == "<mujoco/>"
-        assert set(demo) == {"obs", "next_obs", "actions", "rewards", "dones", "states"}
-        np.testing.assert_array_equal(demo["obs/object"][1:], demo["next_obs/object"][:-1])
-        assert demo["dones"][()].tolist() == [0] * 6 + [1]
-        masks = {key: {name.decode() for name in file[f"mask/{key}"][()]} for key in file["mask"]}
-    assert masks["train"] | masks["valid"] == {f"demo_{i}" for i in range(20)}
-    assert not masks["train"] & masks["valid"]
-    assert [len(masks[key]) for key in ("train", "valid", "50_percent")] == [18, 2, 10]
-    buffer = load_robomimic(path)
-    assert buffer.episode_lengths.tolist() == [4 + i for i in range(20)]
-    np.testing.assert_array_equal(
-        buffer.actions, np.concatenate([episode.actions for episode in episodes]).astype(np.float32)
-    )
-    assert load_robomimic(path, filter_key="50_percent").n_episodes == 10
-
-
-def test_file_appears_only_when_complete(path):
-    with RobomimicWriter(path, env_args()) as writer:
-        writer.add(make_episode(4))
-        assert not path.exists()
-    assert [file.name for file in path.parent.iterdir()] == [path.name]
-
-
-def test_interrupted_writing_leaves_the_old_file(path):
-    path.write_text("old")
-    writer = RobomimicWriter(path, env_args(), overwrite=True)
-
-    def interrupt():
-        with writer:
-            writer.add(make_episode(4))
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupt()
-    assert path.read_text() == "old"
-    assert [file.name for file in path.parent.iterdir()] == [path.name]
-
-
-def test_existing_file_is_not_overwritten(path):
-    path.write_text("old")
-    with pytest.raises(FileExistsError, match="exists already; pass overwrite=True"):
-        RobomimicWriter(path, env_args())
-    with pytest.raises(FileExistsError, match="is a folder"):
-        RobomimicWriter(path.parent, env_args(), overwrite=True)

@@ -1,0 +1,220 @@
+"""A trained agent: its zip file or its RL-Zoo run, what its environment was in training, and whether all of that fits."""
+
+import contextlib
+import importlib
+import inspect
+import json
+import warnings
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+# Names RL-Zoo gives to algorithms that differ from their class names.
+CLASS_NAMES = {"ppo_lstm": "recurrentppo"}
+NOT_NORMALIZED = "none"
+
+
+@dataclass(frozen=True)
+class AgentFiles:
+    """
+    Where an agent is, and what its environment was in training.
+
+    :param model: the agent's zip file
+    :param env_kwargs: arguments of ``gymnasium.make``
+    :param wrapper: puts around an environment what stood between it and the agent
+    :param vec_normalize: file of the statistics that its observations were normalised with, where there is one
+    """
+
+    model: Path
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    wrapper: Callable[[gym.Env], gym.Env] | None = None
+    vec_normalize: Path | None = None
+
+
+def find_agent(model: str | Path, env_id: str) -> AgentFiles:
+    """
+    An agent's files, with the settings of its RL-Zoo run if it lies in one.
+
+    A run's YAML and pickle files are loaded as RL-Zoo does it, so they can run code: name runs that you trust.
+
+    :param model: zip file, or folder of an RL-Zoo run (`logs/ppo/HalfCheetah-v5_1`), whose last model is taken
+    :param env_id: Gymnasium id
+    :raises FileNotFoundError: no agent there
+    :raises ImportError: RL-Zoo is needed and not installed
+    :raises ValueError: the agent was trained on stacked frames or behind a wrapper of vectorised environments
+    """
+    path, name = Path(model), env_id.rsplit(":", 1)[-1].replace("/", "-")  # RL-Zoo's spelling in files and folders
+    if path.is_dir():
+        path = path / f"{name}.zip"
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{path} does not exist; expected a file that a Stable-Baselines3 agent was saved to, or an RL-Zoo run's folder."
+        )
+    run = path.parent / name
+    return _read_run(path, run) if (run / "config.yml").is_file() else AgentFiles(path)
+
+
+def _read_run(model: Path, run: Path) -> AgentFiles:
+    """
+    :param run: the folder beside the model that holds config.yml and args.yml
+    """
+    try:
+        import yaml
+        from rl_zoo3.utils import get_saved_hyperparams, get_wrapper_class
+    except ImportError as error:
+        raise ImportError(f'{run} is an RL-Zoo run; to read it: pip install "sb3-dtfm[zoo]" ({error})') from error
+    hyperparams, _ = get_saved_hyperparams(str(run))
+    for key in ("frame_stack", "vec_env_wrapper"):
+        if hyperparams.get(key):
+            raise ValueError(f"{run / 'config.yml'}: {key} is {hyperparams[key]!r}; agents trained so cannot be recorded.")
+    env_kwargs = hyperparams.get("env_kwargs") or {}
+    if (run / "args.yml").is_file():
+        arguments = yaml.load((run / "args.yml").read_text(), Loader=yaml.UnsafeLoader)
+        env_kwargs = arguments.get("env_kwargs") or env_kwargs  # of the command line, before those of the YAML file
+    statistics = run / "vecnormalize.pkl" if hyperparams["normalize"] else None
+    return AgentFiles(model, dict(env_kwargs), get_wrapper_class(hyperparams), statistics)
+
+
+def find_algorithm(algo: str) -> type[BaseAlgorithm]:
+    """
+    The class of an agent by its name.
+
+    :param algo: class name in any case, or RL-Zoo's name for it
+    :raises ValueError: unknown; names those that are known
+    """
+    known = _known_algorithms()
+    name = CLASS_NAMES.get(algo.lower(), algo.lower())
+    if name not in known:
+        with contextlib.suppress(ImportError):
+            known.update(importlib.import_module("rl_zoo3").ALGOS)
+    if name not in known:
+        raise ValueError(f"Unknown algorithm {algo!r}; known are {', '.join(sorted(known))}.")
+    return known[name]
+
+
+def _known_algorithms() -> dict[str, type[BaseAlgorithm]]:
+    """Stable-Baselines3's and sb3-contrib's, by the class name in lower case."""
+    known: dict[str, type[BaseAlgorithm]] = {}
+    for module_name in ("stable_baselines3", "sb3_contrib"):
+        with contextlib.suppress(ImportError):
+            members = inspect.getmembers(importlib.import_module(module_name), inspect.isclass)
+            known.update({name.lower(): cls for name, cls in members if issubclass(cls, BaseAlgorithm)})
+    return known
+
+
+def load_agent(algo: str, model: str | Path, device: str) -> BaseAlgorithm:
+    """
+    Load an agent to act with.
+
+    What only training needs is left behind: schedules, which may have been pickled by another Python, and the replay buffer.
+
+    :param algo: class name in any case, or RL-Zoo's name for it
+    :param model: zip file
+    :param device: where its network runs
+    :raises ValueError: unknown algorithm, no agent, or one of another algorithm
+    """
+    algorithm = find_algorithm(algo)
+    _check_algorithm(algorithm, Path(model))
+    leave_out = {"learning_rate": 0.0, "lr_schedule": lambda _: 0.0, "clip_range": lambda _: 0.0}
+    kwargs: dict[str, Any] = {"buffer_size": 1} if issubclass(algorithm, OffPolicyAlgorithm) else {}
+    return algorithm.load(model, device=device, custom_objects=leave_out, **kwargs)
+
+
+def _check_algorithm(asked: type[BaseAlgorithm], model: Path) -> None:
+    """
+    Refuse an agent of another algorithm.
+
+    The file does not name its class, but it holds the attributes by name, and the module of the policy. They are nearest
+    to those of the class that saved them, whichever version that was.
+    """
+    try:
+        with zipfile.ZipFile(model) as file:
+            data = json.loads(file.read("data"))
+        saved = {*data, data["policy_class"]["__module__"]}
+    except (zipfile.BadZipFile, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{model} holds no Stable-Baselines3 agent: {error!r}") from error
+
+    def distance(algorithm: type[BaseAlgorithm]) -> int:
+        policy = next(iter(algorithm.policy_aliases))
+        bare: Any = algorithm(policy, env=None, device="cpu", _init_setup_model=False)  # type: ignore[call-arg, arg-type]
+        return len(saved ^ {*vars(bare), bare.policy_class.__module__})
+
+    nearest = min(_known_algorithms().values(), key=distance)
+    if distance(nearest) < distance(asked):
+        raise ValueError(f"{model} was saved by {nearest.__name__}, not by {asked.__name__} (--algo).")
+
+
+def load_fitting_agent(
+    algo: str, files: AgentFiles, env: gym.Env, vec_normalize_path: str | Path | None, device: str
+) -> tuple[BaseAlgorithm, VecNormalize | None]:
+    """
+    Load an agent for an environment, and what normalises its observations.
+
+    :param algo: class name in any case, or RL-Zoo's name for it
+    :param files: the agent's
+    :param env: as the agent sees it
+    :param vec_normalize_path: statistics instead of those in `files`, or "none" to insist that there are none
+    :param device: where its network runs
+    :raises FileNotFoundError: no such statistics
+    :raises ValueError: agent, statistics and environment do not fit, or statistics are missing
+    """
+    model = load_agent(algo, files.model, device)
+    for kind in ("observation_space", "action_space"):
+        agent_space, env_space = getattr(model, kind), getattr(env, kind)
+        if _shapes(agent_space) != _shapes(env_space):
+            env_id = env.spec.id if env.spec else env
+            raise ValueError(f"{files.model.name} was trained with {kind} {agent_space}, but {env_id} has {env_space}.")
+    if vec_normalize_path == NOT_NORMALIZED:
+        return model, None
+    if vec_normalize_path is None and files.vec_normalize is None:
+        _check_not_normalized(model, files.model)
+        return model, None
+    return model, _load_vec_normalize(Path(vec_normalize_path or str(files.vec_normalize)), env)
+
+
+def _shapes(space: spaces.Space) -> Any:
+    return {key: part.shape for key, part in space.spaces.items()} if isinstance(space, spaces.Dict) else space.shape
+
+
+def _load_vec_normalize(path: Path, env: gym.Env) -> VecNormalize:
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist; expected a file that the agent's VecNormalize was saved to.")
+    try:
+        normalizer = VecNormalize.load(str(path), DummyVecEnv([lambda: env]))
+    except Exception as error:  # a pickle can raise anything
+        raise ValueError(f"{path}: no VecNormalize for {env.observation_space}: {error!r}") from error
+    normalizer.training = False
+    return normalizer
+
+
+def _check_not_normalized(model: BaseAlgorithm, path: Path) -> None:
+    """
+    Refuse an agent that was trained with VecNormalize, whose statistics are missing.
+
+    The agent's file holds its last observation, and the one before normalisation, which turns float64 into float32. Where
+    the environment's are float32 already, having the latter means VecNormalize, except for off-policy algorithms, which
+    always have it: then nobody can tell, and there is a warning.
+    """
+    seen, original = _dtypes(model._last_obs), _dtypes(model._last_original_obs)
+    if not original or (seen == original and np.dtype(np.float32) not in seen):
+        return
+    how = f"name its statistics (--vec-normalize FILE) or its RL-Zoo run; --vec-normalize {NOT_NORMALIZED} insists on none."
+    if seen in ([], original) and isinstance(model, OffPolicyAlgorithm):
+        warnings.warn(f"{path.name} does not tell whether it was trained with VecNormalize: if so, {how}", stacklevel=2)
+        return
+    raise ValueError(f"{path.name} was trained with VecNormalize, and what it sees means nothing to it without: {how}")
+
+
+def _dtypes(observation: Any) -> list[np.dtype]:
+    """Of an array, or of each in a dict; none of None."""
+    parts = observation.values() if isinstance(observation, dict) else [observation]
+    return [part.dtype for part in parts if part is not None]

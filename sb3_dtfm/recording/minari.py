@@ -1,0 +1,94 @@
+"""Writes recorded episodes as a Minari dataset."""
+
+import shutil
+import tempfile
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import minari
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from minari.data_collector import EpisodeBuffer
+from minari.dataset.minari_dataset import parse_dataset_id
+from minari.dataset.minari_storage import MinariStorage
+from minari.namespace import create_namespace, list_local_namespaces
+from minari.storage import get_dataset_path
+
+from sb3_dtfm.data.trajectories import DatasetError
+from sb3_dtfm.recording.episodes import RecordedEpisode, stack_observations
+
+
+def check_dataset_id(dataset_id: str, overwrite: bool) -> None:
+    """
+    Refuse an id that cannot be written.
+
+    :raises DatasetError: malformed, or there is such a dataset and `overwrite` is not set
+    """
+    try:
+        parse_dataset_id(dataset_id)
+    except (ValueError, TypeError) as error:
+        raise DatasetError(f"{dataset_id!r} is no Minari id; expected namespace/name-vN.") from error
+    path = get_dataset_path(dataset_id)
+    if path.exists() and not overwrite:
+        raise DatasetError(f"Minari dataset {dataset_id} exists at {path}; choose another id or allow to overwrite it.")
+
+
+def write_minari(
+    dataset_id: str, episodes: Iterable[RecordedEpisode], env: gym.Env, metadata: dict[str, Any]
+) -> minari.MinariDataset:
+    """
+    Write episodes as they come into a hidden folder, which takes the dataset's place when it is complete.
+
+    :param dataset_id: `namespace/name-vN`; a dataset that is there is replaced
+    :param episodes: at least one
+    :param env: gives the spaces and the spec
+    :param metadata: entries of the dataset's metadata; `ref_max_score`, the episodes' mean return, is added
+    """
+    target = get_dataset_path(dataset_id)
+    namespace = parse_dataset_id(dataset_id)[0]
+    staging = Path(tempfile.mkdtemp(prefix=".recording-", dir=get_dataset_path()))
+    try:
+        (staging / "new").mkdir()
+        storage = MinariStorage.new(staging / "new" / "data", env.observation_space, env.action_space, _storable_spec(env))
+        storage.update_metadata({"dataset_id": dataset_id, "minari_version": minari.__version__})
+        returns = []
+        for episode in episodes:
+            storage.update_episodes([_episode_buffer(episode)])
+            returns.append(np.sum(episode.rewards))
+        storage.update_metadata({**metadata, "ref_max_score": float(np.mean(returns))})
+        if namespace is not None and namespace not in list_local_namespaces():
+            create_namespace(namespace)
+        if target.exists():
+            target.rename(staging / "old")
+        (staging / "new").rename(target)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+    return minari.MinariDataset(target / "data")
+
+
+def _episode_buffer(episode: RecordedEpisode) -> EpisodeBuffer:
+    ends = np.zeros((2, len(episode.actions)), dtype=bool)
+    ends[:, -1] = episode.terminated, episode.truncated
+    return EpisodeBuffer(
+        seed=episode.seed,
+        observations=stack_observations(episode.observations),
+        actions=np.stack(episode.actions),
+        rewards=np.asarray(episode.rewards, dtype=np.float64),
+        terminations=ends[0],
+        truncations=ends[1],
+    )
+
+
+def _storable_spec(env: gym.Env) -> EnvSpec | None:
+    """The environment's spec if it can be written to a file; the dataset can do without it."""
+    if env.spec is None:
+        return None
+    try:
+        env.spec.to_json()
+    except (TypeError, ValueError) as error:
+        warnings.warn(f"The environment cannot be recovered from the dataset: {error}", stacklevel=2)
+        return None
+    return env.spec
