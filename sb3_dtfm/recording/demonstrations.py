@@ -17,11 +17,11 @@ from gymnasium import spaces
 from tqdm import tqdm
 
 from sb3_dtfm.data.robomimic import DEFAULT_OBSERVATION_KEYS, RecordedEpisode, RobomimicWriter, refuse_existing
-from sb3_dtfm.envs.demonstrators import DEMONSTRATORS
+from sb3_dtfm.envs.robosuite import TASKS as ROBOSUITE_TASKS
 from sb3_dtfm.envs.robosuite import RobosuiteEnv
 from sb3_dtfm.recording.episodes import check_recording
 
-TASKS = {"lift": "Lift", "can": "Can"}
+TASKS = {name.lower(): name for name, row in ROBOSUITE_TASKS.items() if row.demonstrator is not None}
 ROBOT_COLUMNS = (3, 4, 2)  # widths of the observation keys before the object's
 ATTEMPTS_PER_EPISODE = 5  # a demonstrator that fails more often than this is broken
 
@@ -159,7 +159,9 @@ def _attempt(task: str, seed: int, noise: float, pause: float, attempt: int) -> 
     space, noise_rng = env.action_space, np.random.default_rng(int(noise_seed))
     assert isinstance(space, spaces.Box)
     scale = noise * (space.high - space.low)
-    demonstrator = DEMONSTRATORS[TASKS[task]](int(demonstrator_seed), pause)
+    demonstrator_class = ROBOSUITE_TASKS[TASKS[task]].demonstrator
+    assert demonstrator_class is not None
+    demonstrator = demonstrator_class(int(demonstrator_seed), pause)
     observation, _ = env.reset(seed=int(env_seed))
     observations, actions, states = [observation], [], []
     terminated = truncated = False
