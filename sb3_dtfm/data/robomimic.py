@@ -15,7 +15,7 @@ from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory
-from sb3_dtfm.envs.robosuite import env_kwargs_from_robomimic
+from sb3_dtfm.envs.robosuite import env_id_from_robomimic
 
 DEFAULT_OBSERVATION_KEYS = ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos", "object")
 HDF5_SUFFIXES = (".hdf5", ".h5")
@@ -125,7 +125,7 @@ def _read(
         action_space=_action_space(env_args, n_actions, source),
         n_steps=sum(len(rewards[name]) for name in demos),
         source=source,
-        env_id=_env_id(env_args),
+        env_id=env_id_from_robomimic(env_args),
         storage=storage,
     )
 
@@ -161,14 +161,6 @@ def _env_args(data: h5py.Group, source: str) -> dict[str, Any]:
     except (TypeError, ValueError) as error:
         raise DatasetError(f"{source}: attribute 'env_args' of group 'data' is not JSON ({error}).") from error
     return env_args if isinstance(env_args, dict) else {}
-
-
-def _env_id(env_args: dict[str, Any]) -> str | None:
-    """Gymnasium id of the file's environment, None where none is registered for it."""
-    try:
-        return f"robosuite/{env_kwargs_from_robomimic(env_args)['task']}-v0"
-    except ValueError:
-        return None
 
 
 def _n_steps(demo: h5py.Group, where: str) -> int:

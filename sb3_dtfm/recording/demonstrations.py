@@ -17,8 +17,7 @@ from gymnasium import spaces
 from tqdm import tqdm
 
 from sb3_dtfm.data.robomimic import DEFAULT_OBSERVATION_KEYS
-from sb3_dtfm.envs.demonstrators import DEMONSTRATORS, Demonstrator
-from sb3_dtfm.envs.robosuite import RobosuiteEnv
+from sb3_dtfm.envs.robosuite import TASKS, RobosuiteEnv
 from sb3_dtfm.recording.episodes import EpisodeRecorder, RecordedEpisode, add_noise, check_recording, run_episodes
 from sb3_dtfm.recording.robomimic import refuse_existing, write_robomimic
 
@@ -26,21 +25,9 @@ ROBOT_COLUMNS = (3, 4, 2)  # widths of the observation keys before the object's
 ATTEMPTS_PER_EPISODE = 5  # a demonstrator that fails more often than this is broken
 
 
-class DemonstratedTask(NamedTuple):
-    """
-    A task of :class:`~sb3_dtfm.envs.robosuite.RobosuiteEnv` that a script can do.
-
-    :param name: the environment's name for it
-    :param demonstrator: makes the script from a seed and a mean pause in steps
-    """
-
-    name: str
-    demonstrator: Callable[[int, float], Demonstrator]
-
-
-def demonstrated_tasks() -> dict[str, DemonstratedTask]:
-    """All of them, by their name in lower case."""
-    return {name.lower(): DemonstratedTask(name, demonstrator) for name, demonstrator in DEMONSTRATORS.items()}
+def demonstrated_tasks() -> dict[str, str]:
+    """Names of the robosuite tasks that a script can do, by themselves in lower case."""
+    return {name.lower(): name for name, row in TASKS.items() if row.demonstrator is not None}
 
 
 class RecordingSummary(NamedTuple):
@@ -155,14 +142,16 @@ def _run(attempt: Callable[[int], RecordedEpisode], n_workers: int, limit: int) 
 @functools.cache
 def _environment(task: str) -> EpisodeRecorder:
     """One of each task per process: compiling the scene takes longer than an episode."""
-    return EpisodeRecorder(RobosuiteEnv(demonstrated_tasks()[task].name), simulation=True)
+    return EpisodeRecorder(RobosuiteEnv(demonstrated_tasks()[task]), simulation=True)
 
 
 def _attempt(task: str, seed: int, noise: float, pause: float, number: int) -> RecordedEpisode:
     """One episode, which has succeeded if it is terminated."""
     env = _environment(task)
     env_seed, demonstrator_seed, noise_seed = map(int, np.random.SeedSequence((seed, number)).generate_state(3))
-    demonstrator = demonstrated_tasks()[task].demonstrator(demonstrator_seed, pause)
+    demonstrator_class = TASKS[demonstrated_tasks()[task]].demonstrator
+    assert demonstrator_class is not None
+    demonstrator = demonstrator_class(demonstrator_seed, pause)
 
     def act(observations: np.ndarray, starts: np.ndarray, numbers: Sequence[int]) -> np.ndarray:
         return demonstrator.act(observations[0])[None]

@@ -6,9 +6,9 @@ import pytest
 
 from sb3_dtfm.cli.main import main
 from sb3_dtfm.data.robomimic import load_robomimic
-from sb3_dtfm.envs.robosuite import RobosuiteEnv
+from sb3_dtfm.envs.robosuite import TASKS, RobosuiteEnv
 from sb3_dtfm.recording import demonstrations
-from sb3_dtfm.recording.demonstrations import RecordingSummary, demonstrated_tasks, record_demonstrations
+from sb3_dtfm.recording.demonstrations import RecordingSummary, record_demonstrations
 from sb3_dtfm.recording.episodes import EpisodeRecorder
 
 
@@ -86,7 +86,7 @@ def test_noise_has_the_stated_size_and_is_recorded(tmp_path):
     assert summary.success_rate == 1.0  # so that the second episode is the second attempt
     buffer = load_robomimic(path)
     rows = slice(buffer.episode_lengths[0], None)
-    demonstrator = demonstrated_tasks()["lift"].demonstrator(int(np.random.SeedSequence((3, 1)).generate_state(2)[1]), 0.0)
+    demonstrator = TASKS["Lift"].demonstrator(int(np.random.SeedSequence((3, 1)).generate_state(2)[1]), 0.0)
     own = np.stack([demonstrator.act(observation) for observation in buffer.observations[rows].numpy()])
     recorded = buffer.actions[rows].numpy()
     inside = np.abs(recorded) < 1.0
