@@ -10,24 +10,23 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from tqdm import tqdm
 
-from sb3_dtfm.data.robomimic import DEFAULT_OBSERVATION_KEYS
 from sb3_dtfm.envs.robosuite import TASKS, RobosuiteEnv
+from sb3_dtfm.envs.robosuite.demonstrators import Demonstrator
 from sb3_dtfm.recording.episodes import EpisodeRecorder, RecordedEpisode, add_noise, check_recording, run_episodes
 from sb3_dtfm.recording.robomimic import refuse_existing, write_robomimic
 
-ROBOT_COLUMNS = (3, 4, 2)  # widths of the observation keys before the object's
 ATTEMPTS_PER_EPISODE = 5  # a demonstrator that fails more often than this is broken
 
 
-def demonstrated_tasks() -> dict[str, str]:
-    """Names of the robosuite tasks that a script can do, by themselves in lower case."""
-    return {name.lower(): name for name, row in TASKS.items() if row.demonstrator is not None}
+def demonstrated_tasks() -> dict[str, tuple[str, type[Demonstrator]]]:
+    """The robosuite tasks that a script can do, by their name in lower case: the name, and the script."""
+    return {name.lower(): (name, row.demonstrator) for name, row in TASKS.items() if row.demonstrator is not None}
 
 
 class RecordingSummary(NamedTuple):
@@ -98,7 +97,7 @@ def record_demonstrations(
     refuse_existing(Path(output), overwrite)
     start = time.monotonic()
     n_workers = min(n_workers or _n_cores(), n_episodes)
-    env_args = _environment(task).unwrapped.env_args  # before the workers fork, which then have the compiled scene too
+    env_args = _environment(task).env_args  # before the workers fork, which then have the compiled scene too
     attempt = functools.partial(_attempt, task, seed, noise, pause)
     limit = n_episodes * ATTEMPTS_PER_EPISODE + 10
     lengths: list[int] = []
@@ -140,28 +139,24 @@ def _run(attempt: Callable[[int], RecordedEpisode], n_workers: int, limit: int) 
 
 
 @functools.cache
-def _environment(task: str) -> EpisodeRecorder:
+def _environment(task: str) -> RobosuiteEnv:
     """One of each task per process: compiling the scene takes longer than an episode."""
-    return EpisodeRecorder(RobosuiteEnv(demonstrated_tasks()[task]), simulation=True)
+    return RobosuiteEnv(demonstrated_tasks()[task][0])
 
 
 def _attempt(task: str, seed: int, noise: float, pause: float, number: int) -> RecordedEpisode:
     """One episode, which has succeeded if it is terminated."""
     env = _environment(task)
     env_seed, demonstrator_seed, noise_seed = map(int, np.random.SeedSequence((seed, number)).generate_state(3))
-    demonstrator_class = TASKS[demonstrated_tasks()[task]].demonstrator
-    assert demonstrator_class is not None
-    demonstrator = demonstrator_class(demonstrator_seed, pause)
+    demonstrator = demonstrated_tasks()[task][1](demonstrator_seed, pause)
 
     def act(observations: np.ndarray, starts: np.ndarray, numbers: Sequence[int]) -> np.ndarray:
         return demonstrator.act(observations[0])[None]
 
     assert isinstance(env.action_space, spaces.Box)
     noisy = add_noise(act, env.action_space, noise, lambda _: np.random.default_rng(noise_seed))
-    episode = next(run_episodes([env], noisy, [env_seed]))
-    return replace(episode, observations=[_by_key(observation) for observation in episode.observations])
-
-
-def _by_key(observation: np.ndarray) -> dict[str, Any]:
-    """An observation (O,) as robomimic stores it."""
-    return dict(zip(DEFAULT_OBSERVATION_KEYS, np.split(observation, np.cumsum(ROBOT_COLUMNS)), strict=True))
+    episode = next(run_episodes([EpisodeRecorder(env, simulation=True)], noisy, [env_seed]))
+    widths = env.observation_keys
+    ends = np.cumsum(list(widths.values()))[:-1]
+    by_key = [dict(zip(widths, np.split(observation, ends), strict=True)) for observation in episode.observations]
+    return replace(episode, observations=by_key)

@@ -145,7 +145,7 @@ def _check_algorithm(asked: type[BaseAlgorithm], model: Path) -> None:
 
     def distance(algorithm: type[BaseAlgorithm]) -> int:
         policy = next(iter(algorithm.policy_aliases))
-        bare: Any = algorithm(policy, env=None, device="cpu", _init_setup_model=False)  # type: ignore[call-arg, arg-type]
+        bare: Any = algorithm(policy, env=None, device="cpu", _init_setup_model=False)  # type: ignore[call-arg]
         return len(saved ^ {*vars(bare), bare.policy_class.__module__})
 
     nearest = min(_known_algorithms().values(), key=distance)
