@@ -17,8 +17,8 @@ from gymnasium import spaces
 from tqdm import tqdm
 
 from sb3_dtfm.data.robomimic import DEFAULT_OBSERVATION_KEYS
-from sb3_dtfm.envs.demonstrators import DEMONSTRATORS, Demonstrator
-from sb3_dtfm.envs.robosuite import RobosuiteEnv
+from sb3_dtfm.envs.robosuite import TASKS, RobosuiteEnv
+from sb3_dtfm.envs.robosuite.demonstrators import Demonstrator
 from sb3_dtfm.recording.episodes import EpisodeRecorder, RecordedEpisode, add_noise, check_recording, run_episodes
 from sb3_dtfm.recording.robomimic import refuse_existing, write_robomimic
 
@@ -40,7 +40,11 @@ class DemonstratedTask(NamedTuple):
 
 def demonstrated_tasks() -> dict[str, DemonstratedTask]:
     """All of them, by their name in lower case."""
-    return {name.lower(): DemonstratedTask(name, demonstrator) for name, demonstrator in DEMONSTRATORS.items()}
+    return {
+        name.lower(): DemonstratedTask(name, row.demonstrator)
+        for name, row in TASKS.items()
+        if row.demonstrator is not None
+    }
 
 
 class RecordingSummary(NamedTuple):

@@ -1,83 +1,38 @@
-"""robosuite's Lift and Can tasks as Gymnasium environments, with robomimic's low-dimensional observation."""
+"""robosuite's tasks as Gymnasium environments, with robomimic's low-dimensional observation."""
 
-import json
+import xml.etree.ElementTree as ET
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_dtfm.envs.robosuite_scene import (
-    CONTROL_FREQUENCY,
-    CUBE_SIZE_RANGE,
-    TASKS,
-    cube_size,
-    import_robosuite,
-    make_robosuite,
-    scene_xml,
-    set_cube_size,
-)
-
-
-def register_robosuite_envs() -> None:
-    """
-    Make `gymnasium.make("robosuite/Lift-v0")` and `"robosuite/Can-v0"` work. Repeated calls change nothing.
-
-    No `max_episode_steps` is registered: the horizon is the environment's own argument.
-    """
-    for task in TASKS:
-        env_id = f"robosuite/{task}-v0"
-        if env_id not in gym.registry:
-            gym.register(env_id, entry_point="sb3_dtfm.envs.robosuite:RobosuiteEnv", kwargs={"task": task})
-
-
-def env_kwargs_from_robomimic(env_args: str | dict[str, Any]) -> dict[str, Any]:
-    """
-    Arguments of :class:`RobosuiteEnv` that describe the environment of a robomimic file.
-
-    :param env_args: the `env_args` attribute of the file's `data` group, of robosuite 1.4 or 1.5
-    :return: `task`, `controller_config` and `lite_physics`
-    :raises ValueError: a task, robot or control frequency other than this module's
-    """
-    arguments: dict[str, Any] = json.loads(env_args) if isinstance(env_args, str) else env_args
-    kwargs = arguments.get("env_kwargs", {})
-    tasks = {robosuite_name: task for task, robosuite_name in TASKS.items()}
-    name = arguments.get("env_name")
-    if name not in tasks:
-        raise ValueError(f"env_name is {name!r}; supported are {', '.join(map(repr, tasks))}.")
-    robots = kwargs.get("robots", "Panda")
-    if robots not in ("Panda", ["Panda"]):
-        raise ValueError(f"robots is {robots!r}; only a single 'Panda' is supported.")
-    frequency = kwargs.get("control_freq", CONTROL_FREQUENCY)
-    if frequency != CONTROL_FREQUENCY:
-        raise ValueError(f"control_freq is {frequency!r}; only {CONTROL_FREQUENCY} is supported.")
-    config = kwargs.get("controller_configs")
-    if isinstance(config, list):
-        config = config[0]
-    return {"task": tasks[name], "controller_config": config, "lite_physics": kwargs.get("lite_physics", True)}
+from sb3_dtfm.envs.robosuite.scene import CONTROL_FREQUENCY, import_robosuite, make_robosuite, scene_xml
+from sb3_dtfm.envs.robosuite.sensors import Observer
+from sb3_dtfm.envs.robosuite.tasks import TASKS
 
 
 class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
     """
-    A Panda arm on robosuite's Lift or Can task, moved by an OSC_POSE delta controller at 20 Hz.
+    A Panda arm on one of robosuite's tasks, moved by an OSC_POSE delta controller at 20 Hz.
 
     Actions (7,) lie in [-1, 1]: position change (1 is 0.05 m), rotation change as an axis-angle vector (1 is 0.5 rad),
-    gripper (positive closes). The reward is 1 at the step that solves the task, which terminates the episode with
+    gripper (positive closes); Wipe's are (6,), for its wiper has no fingers. The reward is 1 at the step that solves the task, which terminates the episode with
     `info["is_success"]`, and 0 before; `horizon` truncates.
 
     Observations follow robomimic: `robot0_eef_pos` (3), `robot0_eef_quat` (4, x y z w), `robot0_gripper_qpos` (2), and
-    robosuite 1.5's `object-state`. Lift, 19 in all: cube position (3), cube quaternion (4), gripper to cube (3). Can, 23 in
-    all: can position (3) and quaternion (4) in the gripper's frame, then can position (3) and quaternion (4). All of them
-    describe the state after the step. (robosuite's own `step` returns positions from before it, and its first Can
-    observation of an episode holds zeros; robomimic's files hold the state after the step.)
+    robosuite 1.5's `object-state`; :attr:`observation_keys` has their widths. Lift, 19 in all: cube position (3), cube
+    quaternion (4), gripper to cube (3). Can, 23 in all: can position (3) and quaternion (4) in the gripper's frame, then can
+    position (3) and quaternion (4). All of them describe the state after the step. (robosuite's own `step` returns positions
+    from before it, and its first Can observation of an episode holds zeros; robomimic's files hold the state after the step.)
 
-    Everything random comes from `np_random`, the cube's size included, and an episode depends on nothing but its start:
+    Everything random comes from `np_random`, and an episode depends on nothing but its start:
     the same seed gives the same numbers in any process, whatever was run before.
 
     For `render_mode="rgb_array"` on a machine without display, set `MUJOCO_GL` to `egl` or `osmesa` beforehand.
 
-    :param task: "Lift" or "Can"
-    :param horizon: steps after which an unsolved episode is truncated
+    :param task: a key of :data:`~sb3_dtfm.envs.robosuite.TASKS`
+    :param horizon: steps after which an unsolved episode is truncated; the task's own, 400 for most, if not given
     :param render_mode: None, "rgb_array" or "human"
     :param controller_config: robosuite 1.5 composite controller, or a single-arm controller of robosuite <= 1.4;
         robosuite's default for the Panda if not given
@@ -92,7 +47,7 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
     def __init__(
         self,
         task: str = "Lift",
-        horizon: int = 400,
+        horizon: int | None = None,
         render_mode: str | None = None,
         controller_config: dict[str, Any] | None = None,
         lite_physics: bool = True,
@@ -104,15 +59,16 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
             raise ValueError(f"task must be one of {', '.join(map(repr, TASKS))}, got {task!r}.")
         if render_mode not in (None, "rgb_array", "human"):
             raise ValueError(f"render_mode must be None, 'rgb_array' or 'human', got {render_mode!r}.")
-        if horizon < 1:
+        if horizon is not None and horizon < 1:
             raise ValueError(f"horizon must be at least 1, got {horizon}.")
         self.task = task
-        self.horizon = horizon
+        self._row = TASKS[task]
+        self.horizon = self._row.horizon if horizon is None else horizon
         self.render_mode = render_mode
         self.camera_name = camera_name
         self.width = width
         self.height = height
-        self._env = make_robosuite(task, controller_config, lite_physics)
+        self._env = make_robosuite(self._row.environment, controller_config, lite_physics)
         self._steps = 0
         self._renderer: Any = None
         self._viewer: Any = None
@@ -121,7 +77,8 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
         self._low, self._high = low.astype(np.float32), high.astype(np.float32)
         self.action_space = spaces.Box(self._low, self._high, dtype=np.float32)
         self._start_from(self.state)
-        self.observation_space = spaces.Box(-np.inf, np.inf, self._observation().shape, np.float32)
+        self._observe = Observer(self._env)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (self._observe.size,), np.float32)
 
     @property
     def state(self) -> np.ndarray:
@@ -129,15 +86,20 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
         return np.asarray(self._env.sim.get_state().flatten())
 
     @property
+    def observation_keys(self) -> dict[str, int]:
+        """robomimic's names of what an observation holds, in order, and how many numbers each has."""
+        return dict(self._observe.keys)
+
+    @property
     def model_file(self) -> str:
-        """MuJoCo XML of the scene with the present cube; asset paths start at robosuite's package, as robomimic expects."""
-        return scene_xml(self._env)
+        """MuJoCo XML of the present episode's scene; asset paths start at robosuite's package, as robomimic expects."""
+        return scene_xml(self._env, self._row.variation)
 
     @property
     def env_args(self) -> dict[str, Any]:
         """This environment as robomimic files describe theirs."""
         return {
-            "env_name": TASKS[self.task],
+            "env_name": self._row.environment,
             "env_version": import_robosuite().__version__,
             "type": 1,
             "env_kwargs": {
@@ -160,33 +122,25 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
         Draw a new start, or take a recorded one.
 
         :param seed: restarts the environment's random stream; without it the stream goes on
-        :param options: `{"state": ...}` starts from a recorded :attr:`state`; `"model_file"` beside it brings the cube it
-            was recorded with
+        :param options: `{"state": ...}` starts from a recorded :attr:`state`, and all of Wipe's dirt is there; `"model_file"`
+            beside it brings the scene it was recorded in: the size of Lift's cube, the place of the door or the dirt
         :return: observation and `{"is_success": False}`
         """
         super().reset(seed=seed)
         self._steps = 0
         if options is not None and "state" in options:
-            if self.task == "Lift" and options.get("model_file") is not None:
-                set_cube_size(self._env, cube_size(options["model_file"]))
-            self._start_from(np.asarray(options["state"], np.float64))
+            self._restore(np.asarray(options["state"], np.float64), options.get("model_file"))
         else:
-            if self.task == "Lift":
-                set_cube_size(self._env, self.np_random.uniform(*CUBE_SIZE_RANGE, size=3))
-            self._env.rng = self.np_random
-            for sampler in self._placement_samplers:
-                sampler.rng = self.np_random
-            self._env.reset()
-            self._start_from(self.state)
+            self._draw()
         if self.render_mode == "human":
             self.render()
-        return self._observation(), {"is_success": False}
+        return self._observe(), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """
         Move for 0.05 s.
 
-        :param action: (7,) in [-1, 1]
+        :param action: (A,) in [-1, 1]
         :return: observation, reward (0 or 1), terminated (solved), truncated (horizon), `{"is_success": ...}`
         :raises ValueError: wrong shape, NaN or infinity
         """
@@ -196,11 +150,11 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
             raise ValueError(f"action must be {self._low.shape} finite numbers, got {action!r}.")
         self._advance(np.clip(command, self._low, self._high))
         self._steps += 1
-        success = bool(self._env._check_success())
+        success = self._row.is_solved(self._env)
         truncated = not success and self._steps >= self.horizon
         if self.render_mode == "human":
             self.render()
-        return self._observation(), float(success), success, truncated, {"is_success": success}
+        return self._observe(), float(success), success, truncated, {"is_success": success}
 
     def render(self) -> np.ndarray | None:
         """
@@ -239,18 +193,37 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def _find_references(self) -> None:
         env, robot = self._env, self._env.robots[0]
-        model, arm = env.sim.model, robot.arms[0]
+        model = env.sim.model
         self._n_substeps = round(env.control_timestep / env.model_timestep)
-        self._eef_site = robot.eef_site_id[arm]
-        self._hand_body = model.body_name2id(robot.robot_model.eef_name[arm])
-        self._gripper_qpos = np.asarray(robot._ref_gripper_joint_pos_indexes[arm])
-        self._object_body = env.cube_body_id if self.task == "Lift" else env.obj_body_id["Can"]
         self._actuators = {
             part: (indexes, model.actuator_ctrlrange[indexes, 0].copy(), model.actuator_ctrlrange[indexes, 1].copy())
             for part, indexes in robot._ref_actuators_indexes_dict.items()
         }
-        placement = env.placement_initializer
-        self._placement_samplers = [placement, *getattr(placement, "samplers", {}).values()]
+
+    def _draw(self) -> None:
+        """Start an episode at random."""
+        # All that draws in robosuite shares one generator, which goes on where Gymnasium's stands.
+        rng = self._env.rng
+        rng.bit_generator.state = self.np_random.bit_generator.state
+        if self._row.variation is not None:
+            self._row.variation.draw(self._env, rng)
+        self._env.reset()
+        self.np_random.bit_generator.state = rng.bit_generator.state
+        self._start_from(self.state)
+
+    def _restore(self, state: np.ndarray, model_file: str | None) -> None:
+        """
+        Start an episode from where a recorded one was.
+
+        :param state: (1 + nq + nv,)
+        :param model_file: MuJoCo XML of its scene; the present one if not given
+        """
+        variation = self._row.variation
+        scene = None if variation is None else ET.fromstring(model_file or self.model_file)
+        self._env.reset()  # forgets what the task remembers, such as the dirt that is gone
+        if variation is not None and scene is not None:
+            variation.read(self._env, scene)
+        self._start_from(state)
 
     def _start_from(self, state: np.ndarray) -> None:
         """
@@ -277,7 +250,7 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
         """
         robosuite's own step, less the bookkeeping that nothing here reads; the trajectories are the same to the bit.
 
-        :param action: (7,) float64
+        :param action: (A,) float64
         """
         import mujoco
 
@@ -294,22 +267,3 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
                 ctrl[indexes] = np.clip(control, low, high)
             sim.step2() if lite_physics else sim.step()
         mujoco.mj_kinematics(sim.model._model, sim.data._data)
-
-    def _observation(self) -> np.ndarray:
-        """(19,) or (23,) float32, from MuJoCo's present positions."""
-        import robosuite.utils.transform_utils as transforms
-
-        data = self._env.sim.data
-        eef_position = data.site_xpos[self._eef_site]
-        eef_quaternion = transforms.convert_quat(data.body_xquat[self._hand_body], to="xyzw")
-        position = data.body_xpos[self._object_body]
-        quaternion = transforms.convert_quat(data.body_xquat[self._object_body], to="xyzw")
-        if self.task == "Lift":
-            object_state = [position, quaternion, position - eef_position]
-        else:
-            world_in_gripper = transforms.pose_inv(transforms.pose2mat((eef_position, eef_quaternion)))
-            pose = transforms.pose2mat((position, quaternion))
-            relative = transforms.mat2pose(transforms.pose_in_A_to_pose_in_B(pose, world_in_gripper))
-            object_state = [*relative, position, quaternion]
-        gripper = data.qpos[self._gripper_qpos]
-        return np.concatenate([eef_position, eef_quaternion, gripper, *object_state]).astype(np.float32)

@@ -1,4 +1,4 @@
-"""robosuite itself: imported without its noise, its two scenes built, and the Lift scene's cube changed in place."""
+"""robosuite itself: imported without its noise, its scenes built, and what an episode changes in a built scene."""
 
 import logging
 import os
@@ -8,11 +8,10 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-TASKS = {"Lift": "Lift", "Can": "PickPlaceCan"}  # our names and robosuite's
 CONTROL_FREQUENCY = 20  # Hz
 
 CUBE_SIZE_RANGE = (0.020, 0.022)  # metres: half extents that robosuite draws its cube from whenever it builds the scene
@@ -74,11 +73,11 @@ def _silence() -> Iterator[None]:
         logger.removeFilter(is_error)
 
 
-def make_robosuite(task: str, controller_config: dict[str, Any] | None, lite_physics: bool) -> Any:
+def make_robosuite(environment: str, controller_config: dict[str, Any] | None, lite_physics: bool) -> Any:
     """
     robosuite's own environment, without cameras, renderer and horizon.
 
-    :param task: "Lift" or "Can"
+    :param environment: robosuite's name of the task
     :param controller_config: of robosuite 1.5 or <= 1.4; robosuite's default for the Panda if not given
     :param lite_physics: see :class:`~sb3_dtfm.envs.robosuite.RobosuiteEnv`
     """
@@ -89,11 +88,12 @@ def make_robosuite(task: str, controller_config: dict[str, Any] | None, lite_phy
         if controller_config is not None:
             controller_config = refactor_composite_controller_config(controller_config, "Panda", ["right"])
         return robosuite.make(
-            TASKS[task],
+            environment,
             robots="Panda",
             controller_configs=controller_config,
             control_freq=CONTROL_FREQUENCY,
             lite_physics=lite_physics,
+            reward_shaping=False,
             use_camera_obs=False,
             has_renderer=False,
             has_offscreen_renderer=False,
@@ -102,6 +102,104 @@ def make_robosuite(task: str, controller_config: dict[str, Any] | None, lite_phy
             ignore_done=True,
             seed=0,
         )
+
+
+def scene_xml(env: Any, variation: "SceneVariation | None") -> str:
+    """
+    MuJoCo XML of a scene as it is at present; asset paths start at robosuite's package, as robomimic expects.
+
+    :param env: robosuite's environment
+    :param variation: what episodes change in this scene
+    """
+    package = os.path.dirname(import_robosuite().__file__ or "")
+    xml = re.sub(r'file="' + re.escape(package), 'file="robosuite', env.edit_model_xml(env.model.get_xml()))
+    if variation is None:
+        return xml
+    root = ET.fromstring(xml)
+    variation.write(env, root)
+    return ET.tostring(root, encoding="unicode")
+
+
+class SceneVariation(Protocol):
+    """What one episode's scene has otherwise than another's, beside the positions and velocities that a state holds."""
+
+    def draw(self, env: Any, rng: np.random.Generator) -> None:
+        """
+        Before robosuite's own reset, draw what that does not.
+
+        :param env: robosuite's environment
+        :param rng: source of randomness
+        """
+
+    def write(self, env: Any, scene: ET.Element) -> None:
+        """
+        Put what the compiled scene has at present into its XML.
+
+        :param env: robosuite's environment
+        :param scene: root of the XML
+        """
+
+    def read(self, env: Any, scene: ET.Element) -> None:
+        """
+        Give the compiled scene what was recorded.
+
+        :param env: robosuite's environment
+        :param scene: root of the recorded XML
+        """
+
+
+class CubeSize:
+    """Lift's cube, which robosuite draws whenever it builds the scene; here it changes in the compiled one."""
+
+    def draw(self, env: Any, rng: np.random.Generator) -> None:
+        set_cube_size(env, rng.uniform(*CUBE_SIZE_RANGE, size=3))
+
+    def write(self, env: Any, scene: ET.Element) -> None:
+        for name in ("cube_g0", "cube_g0_vis"):
+            _named(scene, "geom", name).set("size", _numbers(env.cube.size))
+
+    def read(self, env: Any, scene: ET.Element) -> None:
+        set_cube_size(env, np.array(_named(scene, "geom", "cube_g0").get("size", "").split(), np.float64))
+
+
+class BodyPoses:
+    """
+    Bodies without a joint, which robosuite's reset puts elsewhere in the compiled scene.
+
+    :param names: of the bodies
+    """
+
+    def __init__(self, *names: str) -> None:
+        self.names = names
+
+    def draw(self, env: Any, rng: np.random.Generator) -> None:
+        pass
+
+    def write(self, env: Any, scene: ET.Element) -> None:
+        model = env.sim.model
+        for name in self.names:
+            index, body = model.body_name2id(name), _named(scene, "body", name)
+            body.set("pos", _numbers(model.body_pos[index]))
+            body.set("quat", _numbers(model.body_quat[index]))
+
+    def read(self, env: Any, scene: ET.Element) -> None:
+        model = env.sim.model
+        for name in self.names:
+            index, body = model.body_name2id(name), _named(scene, "body", name)
+            model.body_pos[index] = np.array(body.get("pos", "0 0 0").split(), np.float64)
+            model.body_quat[index] = np.array(body.get("quat", "1 0 0 0").split(), np.float64)
+
+
+def _named(scene: ET.Element, tag: str, name: str) -> ET.Element:
+    element = scene.find(f".//{tag}[@name='{name}']")
+    if element is None:
+        raise ValueError(f"model_file holds no {tag} named {name!r}; it is of another task.")
+    return element
+
+
+def _numbers(values: np.ndarray | list[float]) -> str:
+    """As MuJoCo's XML has them, with all digits."""
+    return " ".join(repr(float(value)) for value in values)
 
 
 def set_cube_size(env: Any, size: np.ndarray) -> None:
@@ -125,32 +223,3 @@ def set_cube_size(env: Any, size: np.ndarray) -> None:
     model.body_mass[body] = mass
     model.body_inertia[body] = mass / 3.0 * (squares.sum() - squares)
     mujoco.mj_setConst(model, env.sim.data._data)
-
-
-def scene_xml(env: Any) -> str:
-    """
-    MuJoCo XML of a scene with its present cube; asset paths start at robosuite's package, as robomimic expects.
-
-    :param env: robosuite's environment
-    """
-    package = os.path.dirname(import_robosuite().__file__ or "")
-    xml = re.sub(r'file="' + re.escape(package), 'file="robosuite', env.edit_model_xml(env.model.get_xml()))
-    if not hasattr(env, "cube"):
-        return xml
-    root = ET.fromstring(xml)
-    for geom in root.iter("geom"):
-        if geom.get("name", "").startswith("cube_g0"):
-            geom.set("size", " ".join(repr(half) for half in env.cube.size))
-    return ET.tostring(root, encoding="unicode")
-
-
-def cube_size(model_file: str) -> np.ndarray:
-    """
-    Half extents of the cube in a Lift scene, (3,) metres.
-
-    :param model_file: MuJoCo XML
-    """
-    for geom in ET.fromstring(model_file).iter("geom"):
-        if geom.get("name") == "cube_g0":
-            return np.array(geom.get("size", "").split(), np.float64)
-    raise ValueError("model_file holds no geom named 'cube_g0'; a robosuite Lift scene is expected.")

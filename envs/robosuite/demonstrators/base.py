@@ -1,4 +1,4 @@
-"""Scripted demonstrators for robosuite's Lift and Can: they see the observation vector alone and act through OSC_POSE."""
+"""What all demonstrators share: a manner, the way to the object, the grasp, and an unsteady hand."""
 
 from dataclasses import dataclass
 
@@ -19,9 +19,6 @@ MISJUDGEMENT_RATE = 0.07  # of episodes whose first grasp closes on air, which s
 FINGERS_OPEN = 0.03  # metres from the middle
 FINGERS_STILL = 4e-4  # metres per step
 DOWNWARD = np.array([1.0, 0.0, 0.0, 0.0])  # hand pointing down, as x y z w
-CAN_BIN_CENTRE = np.array([0.1975, 0.405])  # metres: the compartment of the target bin that is the can's
-CAN_CLEARANCE = 0.955  # metres: a can this high passes over the bins' walls
-CAN_REST_HEIGHT = 0.86  # metres: of a can standing in its bin
 
 
 @dataclass(frozen=True)
@@ -39,8 +36,8 @@ class Manner:
     :param grasp_height_tolerance: height above the grasp point at which the fingers close, metres
     :param dwell: steps between fingers at rest and the lift
     :param lift_drift: (2,) sideways share of the lift's direction
-    :param carry_height: of the object above the walls, metres
-    :param release_offset: (2,) of the place of release from the compartment's centre, metres
+    :param carry_height: of the object above what it has to pass over, metres
+    :param release_offset: (2,) of the place of release from the middle of the goal, metres
     :param release_tolerance: distance from that place at which the fingers open, metres
     :param noise: standard deviation of the unsteadiness of the hand, action units
     :param noise_memory: its correlation from step to step
@@ -94,7 +91,7 @@ class Manner:
 
 class Demonstrator:
     """
-    Hover above the object, descend, grasp; what follows is the task's.
+    Hover above the object, descend, grasp; what follows is the task's. It sees the observation alone and acts through OSC_POSE.
 
     A grasp that closes on nothing, or an object lost on the way, leads back to the hover point.
 
@@ -108,6 +105,8 @@ class Demonstrator:
     grasp_height = 0.0  # metres above the object's centre
     misjudgement = 0.04  # metres too high where a first grasp goes wrong
     speed_range = (0.35, 0.7)
+    turn_speed = 0.2  # largest action magnitude of a turn
+    turn_tolerance = np.inf  # radians from the orientation of the grasp at which the descent may start
     free_stages = ("hover", "descend")  # where a jerk does no harm
 
     def __init__(self, seed: int | np.random.SeedSequence | None = None, pause: float = 0.0) -> None:
@@ -127,23 +126,32 @@ class Demonstrator:
         self._jerk = np.zeros(6)
         self._jerk_steps = 0
         self._fingers = 0.0
+        self._orientation = DOWNWARD  # that the hand should take, x y z w
+        self._to_turn = 0.0  # radians
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """
         The next action.
 
-        :param observation: (19,) for Lift, (23,) for Can
+        :param observation: (O,) of the task
         :return: (7,) float32 in [-1, 1]
         """
         observation = np.asarray(observation, np.float64)
-        hand, orientation = observation[:3], observation[3:7]
+        hand = observation[:3]
         fingers = float(observation[7] - observation[8]) / 2.0
         finger_speed, self._fingers = abs(fingers - self._fingers), fingers
-        stage = self._next_stage(hand, observation[self.object_columns], fingers, finger_speed)
+        position = self._look(observation)
+        turn = _rotation_between(observation[3:7], self._orientation)
+        self._to_turn = float(np.linalg.norm(turn))
+        stage = self._next_stage(hand, position, fingers, finger_speed)
         self._steps_in_stage = self._steps_in_stage + 1 if stage == self.stage else 0
         self.stage = stage
-        target, gripper = self._target(hand, observation[self.object_columns])
-        return self._move(target - hand, _rotation_between(orientation, DOWNWARD), gripper)
+        target, gripper = self._target(hand, position)
+        return self._move(target - hand, turn, gripper)
+
+    def _look(self, observation: np.ndarray) -> np.ndarray:
+        """Where the object is, (3,) metres. What else a task has to see, such as how the hand should turn, it sees here."""
+        return observation[self.object_columns]
 
     def _next_stage(self, hand: np.ndarray, position: np.ndarray, fingers: float, finger_speed: float) -> str:
         manner = self.manner
@@ -151,7 +159,8 @@ class Demonstrator:
         aside = float(np.hypot(*to_grasp[:2]))
         if self.stage == "hover":
             above = aside < manner.hover_tolerance + float(np.hypot(*manner.hover_offset))
-            return "descend" if above and fingers > FINGERS_OPEN else "hover"
+            ready = fingers > FINGERS_OPEN and self._to_turn < self.turn_tolerance
+            return "descend" if above and ready else "hover"
         if self.stage == "descend":
             if aside > 0.04:
                 return "hover"
@@ -206,7 +215,7 @@ class Demonstrator:
         wanted = np.empty(6)
         wanted[:3] = offset / (METRES_PER_SECOND * manner.time_constant)
         wanted[:3] *= min(1.0, manner.speed / max(float(np.linalg.norm(wanted[:3])), 1e-9))
-        wanted[3:] = np.clip(rotation / (RADIANS_PER_SECOND * 1.5 * manner.time_constant), -0.2, 0.2)
+        wanted[3:] = np.clip(rotation / (RADIANS_PER_SECOND * 1.5 * manner.time_constant), -self.turn_speed, self.turn_speed)
         self._movement += np.clip(wanted - self._movement, -manner.agility, manner.agility)
         # A hand in motion shakes more than one that aims, and turns less than it shifts.
         effort = 0.3 + 0.7 * float(np.linalg.norm(self._movement[:3])) / manner.speed
@@ -234,63 +243,6 @@ class Demonstrator:
         return np.zeros(6)
 
 
-class LiftDemonstrator(Demonstrator):
-    """Grasps the cube and lifts it off the table."""
-
-    def _after_grasp(self) -> str:
-        return "lift"
-
-    def _next_stage_holding(self, hand: np.ndarray, position: np.ndarray, fingers: float) -> str:
-        lost = fingers < self.smallest_grip or np.linalg.norm(position - hand) > 0.05
-        return "hover" if lost else self.stage
-
-    def _target_holding(self, hand: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, float]:
-        return hand + 0.1 * np.array([*self.manner.lift_drift, 1.0]), CLOSE
-
-
-class CanDemonstrator(Demonstrator):
-    """Grasps the can, raises it over the wall, carries it to its compartment and lets go."""
-
-    object_columns = slice(16, 19)
-    grasp_height = 0.015
-    misjudgement = 0.055
-    speed_range = (0.75, 1.15)  # it has half a metre to go
-
-    def _after_grasp(self) -> str:
-        return "raise"
-
-    def _next_stage_holding(self, hand: np.ndarray, position: np.ndarray, fingers: float) -> str:
-        manner = self.manner
-        if self.stage == "release":
-            fallen_outside = self._steps_in_stage > 15
-            return "hover" if fallen_outside else "release"
-        if fingers < self.smallest_grip or np.linalg.norm(position - hand) > 0.07:
-            return "hover"
-        if self.stage == "raise" and position[2] > CAN_CLEARANCE:
-            return "carry"
-        aside = float(np.hypot(*(self._release_point() - position[:2])))
-        if self.stage == "carry" and aside < manner.release_tolerance:
-            return "release"
-        return self.stage
-
-    def _target_holding(self, hand: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, float]:
-        height = CAN_CLEARANCE + self.manner.carry_height
-        if self.stage == "raise":
-            # Leans towards the target while rising, the more the higher the can already is.
-            risen = np.clip((position[2] - CAN_REST_HEIGHT) / (CAN_CLEARANCE - CAN_REST_HEIGHT), 0.0, 1.0)
-            sideways = 0.15 * risen * (self._release_point() - position[:2])
-            return hand + np.array([*sideways, height + 0.02 - position[2]]), CLOSE
-        if self.stage == "carry":
-            return hand + np.array([*self._release_point(), height]) - position, CLOSE
-        return hand + np.array([0.0, 0.0, 0.01]), OPEN
-
-    def _release_point(self) -> np.ndarray:
-        return CAN_BIN_CENTRE + self.manner.release_offset
-
-
-DEMONSTRATORS: dict[str, type[Demonstrator]] = {"Lift": LiftDemonstrator, "Can": CanDemonstrator}
-
-
 def _rotation_between(quaternion: np.ndarray, goal: np.ndarray) -> np.ndarray:
     """
     Axis-angle rotation in the world's frame that turns one orientation into another.
@@ -306,3 +258,32 @@ def _rotation_between(quaternion: np.ndarray, goal: np.ndarray) -> np.ndarray:
         turned, cosine = -turned, -cosine
     sine = float(np.linalg.norm(turned))
     return turned * (2.0 * np.arctan2(sine, cosine) / max(sine, 1e-9))
+
+
+def downward(yaw: float) -> np.ndarray:
+    """
+    A hand that points down, turned about the vertical; its fingers open along the y axis for 0, and for half a turn.
+
+    :param yaw: radians
+    :return: (4,) x y z w
+    """
+    return np.array([np.cos(yaw / 2.0), np.sin(yaw / 2.0), 0.0, 0.0])
+
+
+def hand_yaw(quaternion: np.ndarray) -> float:
+    """
+    How far a hand that points down is turned about the vertical, radians.
+
+    :param quaternion: (4,) x y z w
+    """
+    return float(2.0 * np.arctan2(quaternion[1], quaternion[0]))
+
+
+def object_yaw(quaternion: np.ndarray) -> float:
+    """
+    How far an object that lies flat is turned about the vertical, radians in [-pi, pi].
+
+    :param quaternion: (4,) x y z w
+    """
+    x, y, z, w = quaternion
+    return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))

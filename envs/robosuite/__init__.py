@@ -1,0 +1,18 @@
+"""robosuite's single-arm tasks as Gymnasium environments: a table of tasks, one environment, demonstrators."""
+
+from sb3_dtfm.envs.robosuite.env import RobosuiteEnv
+from sb3_dtfm.envs.robosuite.registration import (
+    env_id_from_robomimic,
+    env_kwargs_from_robomimic,
+    register_robosuite_envs,
+)
+from sb3_dtfm.envs.robosuite.tasks import TASKS, RobosuiteTask
+
+__all__ = [
+    "TASKS",
+    "RobosuiteEnv",
+    "RobosuiteTask",
+    "env_id_from_robomimic",
+    "env_kwargs_from_robomimic",
+    "register_robosuite_envs",
+]

@@ -1,0 +1,75 @@
+"""The names of the tasks: Gymnasium's, and those in robomimic's files."""
+
+import json
+from typing import Any
+
+import gymnasium as gym
+
+from sb3_dtfm.envs.robosuite.scene import CONTROL_FREQUENCY
+from sb3_dtfm.envs.robosuite.tasks import TASKS
+
+ROBOSUITE_TYPE = 1  # robomimic's number for robosuite's environments
+
+
+def register_robosuite_envs() -> None:
+    """
+    Make `gymnasium.make("robosuite/Lift-v0")` and the other tasks' ids work. Repeated calls change nothing.
+
+    No `max_episode_steps` is registered: the horizon is the environment's own argument.
+    """
+    for task in TASKS:
+        if _env_id(task) not in gym.registry:
+            gym.register(_env_id(task), entry_point="sb3_dtfm.envs.robosuite:RobosuiteEnv", kwargs={"task": task})
+
+
+def env_id_from_robomimic(env_args: str | dict[str, Any]) -> str | None:
+    """
+    Gymnasium id of the task of a robomimic file.
+
+    :param env_args: the `env_args` attribute of the file's `data` group
+    :return: such as "robosuite/Lift-v0"; None for a task that is not one of ours
+    """
+    task = _task(_parsed(env_args))
+    return None if task is None else _env_id(task)
+
+
+def env_kwargs_from_robomimic(env_args: str | dict[str, Any]) -> dict[str, Any]:
+    """
+    Arguments of :class:`~sb3_dtfm.envs.robosuite.RobosuiteEnv` that describe the environment of a robomimic file.
+
+    :param env_args: the `env_args` attribute of the file's `data` group, of robosuite 1.4 or 1.5
+    :return: `task`, `controller_config` and `lite_physics`
+    :raises ValueError: a task, robot or control frequency other than this module's
+    """
+    arguments = _parsed(env_args)
+    kwargs = arguments.get("env_kwargs", {})
+    task = _task(arguments)
+    if task is None:
+        supported = ", ".join(repr(row.environment) for row in TASKS.values())
+        raise ValueError(f"env_name is {arguments.get('env_name')!r}; supported are {supported}.")
+    robots = kwargs.get("robots", "Panda")
+    if robots not in ("Panda", ["Panda"]):
+        raise ValueError(f"robots is {robots!r}; only a single 'Panda' is supported.")
+    frequency = kwargs.get("control_freq", CONTROL_FREQUENCY)
+    if frequency != CONTROL_FREQUENCY:
+        raise ValueError(f"control_freq is {frequency!r}; only {CONTROL_FREQUENCY} is supported.")
+    config = kwargs.get("controller_configs")
+    if isinstance(config, list):
+        config = config[0]
+    return {"task": task, "controller_config": config, "lite_physics": kwargs.get("lite_physics", True)}
+
+
+def _parsed(env_args: str | dict[str, Any]) -> dict[str, Any]:
+    arguments: dict[str, Any] = json.loads(env_args) if isinstance(env_args, str) else env_args
+    return arguments
+
+
+def _task(arguments: dict[str, Any]) -> str | None:
+    if arguments.get("type", ROBOSUITE_TYPE) != ROBOSUITE_TYPE:
+        return None
+    tasks = {row.environment: task for task, row in TASKS.items()}
+    return tasks.get(arguments.get("env_name", ""))
+
+
+def _env_id(task: str) -> str:
+    return f"robosuite/{task}-v0"

@@ -1,0 +1,72 @@
+"""The robosuite tasks, one row each. Another one needs another row, and nothing else."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from sb3_dtfm.envs.robosuite.demonstrators import (
+    CanDemonstrator,
+    Demonstrator,
+    LiftDemonstrator,
+    SquareDemonstrator,
+    StackDemonstrator,
+)
+from sb3_dtfm.envs.robosuite.scene import BodyPoses, CubeSize, SceneVariation
+
+
+def check_success(env: Any) -> bool:
+    """
+    Whether robosuite holds the task for solved.
+
+    :param env: robosuite's environment
+    """
+    return bool(env._check_success())
+
+
+def wipe_and_check(env: Any) -> bool:
+    """
+    Whether the table is clean.
+
+    :param env: robosuite's environment, which takes away the dirt under the wiper when it is asked for the reward
+    """
+    env.reward()
+    return check_success(env)
+
+
+@dataclass(frozen=True)
+class RobosuiteTask:
+    """
+    A task of robosuite, as far as it differs from the others.
+
+    What is observed of its objects is robosuite's `object-state`, and where they lie is drawn by robosuite.
+
+    :param environment: robosuite's name
+    :param horizon: steps after which an unsolved episode is truncated: 400, as in robomimic, for each object to move
+    :param variation: what one episode's scene has otherwise than another's, beside its state
+    :param is_solved: from robosuite's environment after a step
+    :param demonstrator: who shows how it is done
+    """
+
+    environment: str
+    horizon: int = 400
+    variation: SceneVariation | None = None
+    is_solved: Callable[[Any], bool] = check_success
+    demonstrator: type[Demonstrator] | None = None
+
+
+TASKS: dict[str, RobosuiteTask] = {
+    "Lift": RobosuiteTask("Lift", variation=CubeSize(), demonstrator=LiftDemonstrator),
+    "Stack": RobosuiteTask("Stack", demonstrator=StackDemonstrator),
+    "NutAssembly": RobosuiteTask("NutAssembly", horizon=800),
+    "Square": RobosuiteTask("NutAssemblySquare", demonstrator=SquareDemonstrator),
+    "Round": RobosuiteTask("NutAssemblyRound"),
+    "PickPlace": RobosuiteTask("PickPlace", horizon=1600),
+    "Can": RobosuiteTask("PickPlaceCan", demonstrator=CanDemonstrator),
+    "Milk": RobosuiteTask("PickPlaceMilk"),
+    "Bread": RobosuiteTask("PickPlaceBread"),
+    "Cereal": RobosuiteTask("PickPlaceCereal"),
+    "Door": RobosuiteTask("Door", variation=BodyPoses("Door_main")),
+    "Wipe": RobosuiteTask(
+        "Wipe", variation=BodyPoses(*(f"contact{marker}_main" for marker in range(100))), is_solved=wipe_and_check
+    ),
+}
