@@ -60,6 +60,7 @@ TASKS: dict[str, RobosuiteTask] = {
     "NutAssembly": RobosuiteTask("NutAssembly", horizon=800),
     "Square": RobosuiteTask("NutAssemblySquare", demonstrator=SquareDemonstrator),
     "Round": RobosuiteTask("NutAssemblyRound"),
+    "ToolHang": RobosuiteTask("ToolHang", horizon=700),
     "PickPlace": RobosuiteTask("PickPlace", horizon=1600),
     "Can": RobosuiteTask("PickPlaceCan", demonstrator=CanDemonstrator),
     "Milk": RobosuiteTask("PickPlaceMilk"),

@@ -8,6 +8,8 @@ from sb3_dtfm.envs.robosuite.demonstrators.placing import PlacingDemonstrator
 PEG = np.array([0.23, 0.1])  # metres: its axis
 PEG_TOP = 0.95  # metres
 HANDLE = 0.060  # metres from the middle of the nut to where the hand holds it
+FITTING = 0.5 * np.pi * np.array([1.0, 2.0, 3.0])  # yaws of a nut on the peg; with its handle ahead, the arm is too short
+LEAST_HAND_YAW = -np.pi / 3.0  # the wrist turns further to the other side
 
 
 class SquareDemonstrator(PlacingDemonstrator):
@@ -30,10 +32,13 @@ class SquareDemonstrator(PlacingDemonstrator):
         turned = object_yaw(observation[19:23])
         self._handle = HANDLE * np.array([np.cos(turned), np.sin(turned)])
         if self.stage in ("hover", "descend", "pause", "grasp"):
-            self._square_yaw = 0.5 * np.pi * np.round(turned / (0.5 * np.pi))
-            self._orientation = downward(float(np.arctan(np.tan(turned))))  # half a turn of the hand changes nothing
+            turns = (FITTING - turned + np.pi) % (2.0 * np.pi) - np.pi
+            self._nut_yaw = turned + float(turns[np.argmin(np.abs(turns))])
+            # Half a turn of the hand changes nothing.
+            self._orientation = downward((turned - LEAST_HAND_YAW) % np.pi + LEAST_HAND_YAW)
         else:
-            self._orientation = downward(hand_yaw(observation[3:7]) + self._square_yaw - turned)
+            to_turn = (self._nut_yaw - turned + np.pi) % (2.0 * np.pi) - np.pi
+            self._orientation = downward(hand_yaw(observation[3:7]) + to_turn)
         return observation[16:19] + np.array([*self._handle, 0.0])
 
     def _place(self) -> np.ndarray:
