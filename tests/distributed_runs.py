@@ -17,12 +17,12 @@ from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.distributed import first_of_each_machine_first
 from sb3_dtfm.networks import trunk
-from sb3_dtfm.networks.dropout import dropout
+from sb3_dtfm.networks.cpu import dropout
 from tests.conftest import TINY_FLOW_POLICY, TINY_POLICY
 
 ALGORITHMS = {"DT": (DT, TINY_POLICY), "DTFM": (DTFM, {**TINY_FLOW_POLICY, "regression_coef": 0.5})}
 N_STEPS = 12
-DOWNLOAD = 6.0  # seconds
+DOWNLOAD = 4.0  # seconds
 
 
 def make_buffer() -> TrajectoryBuffer:
@@ -99,22 +99,28 @@ def refusal_of_an_odd_batch() -> str:
     return ""
 
 
-def wait_for_a_slow_download() -> float:
+def meet_again(meeting_point: Path, **kwargs) -> None:
+    """Processes that know each other start anew; other arguments are those of `init_process_group`."""
+    rank = dist.get_rank()
+    dist.barrier()
+    dist.destroy_process_group()
+    dist.init_process_group("gloo", store=dist.FileStore(str(meeting_point), 2), rank=rank, world_size=2, **kwargs)
+
+
+def wait_for_a_slow_download(folder: Path) -> float:
     """
     Process 1 waits for longer than the processes' messages to each other may take.
 
+    :param folder: for what the processes leave there
     :return: seconds waited
     """
-    dist.barrier()  # both are here: to meet again has the same limit
-    dist.destroy_process_group()
-    dist.init_process_group("gloo", timeout=timedelta(seconds=DOWNLOAD / 2))
+    meet_again(folder / "impatient", timeout=timedelta(seconds=DOWNLOAD / 2))
     start = time.monotonic()
     with first_of_each_machine_first():
         if dist.get_rank() == 0:
             time.sleep(DOWNLOAD)
     waited = time.monotonic() - start
-    dist.destroy_process_group()
-    dist.init_process_group("gloo")
+    meet_again(folder / "patient")
     return waited
 
 
@@ -140,7 +146,7 @@ def main(folder: Path) -> None:
         model = train(name, folder / name / f"process_{dist.get_rank()}")
         results[name] = model.policy.state_dict()
     th.save(results, folder / f"process_{dist.get_rank()}.pt")
-    th.save(wait_for_a_slow_download(), folder / f"download_{dist.get_rank()}.pt")
+    th.save(wait_for_a_slow_download(folder), folder / f"download_{dist.get_rank()}.pt")
     dist.barrier()
     fail_on_process_1(step=3)
 

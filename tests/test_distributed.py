@@ -12,7 +12,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tests.distributed_runs import ALGORITHMS, DOWNLOAD, N_STEPS, train
 
 ROOT = Path(__file__).parents[1]
-LIMIT = 60  # seconds after which two processes that wait for each other are taken as hanging
+LIMIT = 180  # seconds after which two processes that wait for each other are taken as hanging
 
 
 def torchrun(*arguments: str, **kwargs) -> subprocess.CompletedProcess:

@@ -8,6 +8,7 @@ import torch as th
 
 from sb3_dtfm import DT, DTFM
 from tests.algorithms.small import make_model
+from tests.conftest import make_env
 
 NAN = float("nan")
 # For each argument what is refused.
@@ -111,19 +112,38 @@ def test_an_unknown_argument_of_the_policy_is_refused_with_those_accepted(algori
     assert flow <= set(words) if algorithm is DTFM else not flow & set(words)
 
 
+NUMPY = dict(
+    batch_size=np.int64(8), context_length=np.int32(4), learning_rate=np.float32(1e-3), weight_decay=np.float64(0.01),
+    warmup_steps=np.int64(2), max_grad_norm=np.float32(0.5), ema_decay=np.float64(0.9), timestep_exponent=np.float32(1.5),
+    dataset_fraction=np.float32(0.5), dataset_seed=np.int64(1),
+)  # fmt: skip
+NUMPY_POLICY = dict(embed_dim=np.int64(16), n_layers=np.int64(1), n_heads=np.int32(2), dropout=np.float32(0.1))
+NUMPY_FLOW = dict(
+    flow_hidden_dim=np.int64(16), flow_n_layers=np.int64(1), flow_tau_exponent=np.float32(1.5), n_solver_steps=np.int64(3),
+    regression_coef=np.float64(0.5),
+)  # fmt: skip
+
+
 @pytest.mark.parametrize("algorithm", [DT, DTFM])
 def test_numbers_of_numpy_are_numbers(algorithm, cheetah_buffer, tmp_path):
-    """As a search or a grid made with NumPy gives them; saved and loaded, they are what they were."""
-    given = dict(
-        batch_size=np.int64(8), context_length=np.int32(4), learning_rate=np.float32(1e-3), weight_decay=np.float64(0.01),
-        warmup_steps=np.int64(2), max_grad_norm=np.float32(0.5), ema_decay=np.float64(0.9),
-    )  # fmt: skip
-    sizes = {"embed_dim": np.int64(16), "n_layers": np.int64(1), "dropout": np.float32(0.1)}
-    model = make_model(algorithm, cheetah_buffer, **given, policy_kwargs=sizes).learn(2)
+    """As a search or a grid made with NumPy gives them; the model can be saved, and loaded is what it was."""
+    policy_kwargs = NUMPY_POLICY if algorithm is DT else {**NUMPY_POLICY, **NUMPY_FLOW}
+    model = make_model(algorithm, cheetah_buffer, **NUMPY, policy_kwargs=policy_kwargs).learn(2)
     model.save(tmp_path / "model")
-    loaded = algorithm.load(tmp_path / "model")
-    assert (loaded.batch_size, loaded.context_length, loaded.policy.embed_dim) == (8, 4, 16)
-    assert loaded.learning_rate == np.float32(1e-3)
+    loaded = algorithm.load(tmp_path / "model", dataset=cheetah_buffer)
+    for name, value in NUMPY.items():
+        assert getattr(loaded, name) == value, name
+    assert th.equal(weights(loaded), weights(model))
+    assert loaded.learn(1).num_timesteps == 1
+    model.policy.save(str(tmp_path / "policy"))
+    assert np.array_equal(
+        *(first_action(each) for each in (model.policy, type(model.policy).load(str(tmp_path / "policy"))))
+    )
+
+
+def first_action(policy) -> np.ndarray:
+    observation, _ = make_env().reset(seed=0)
+    return policy.predict(observation, deterministic=True)[0]
 
 
 def weights(model):

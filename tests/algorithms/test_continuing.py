@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from stable_baselines3.common.callbacks import CallbackList, EvalCallback, EveryNTimesteps
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_dtfm import DT, DTFM
@@ -30,10 +30,6 @@ def one_step_buffer(cheetah_buffer):
     return TrajectoryBuffer.from_trajectories([step], cheetah_buffer.action_space)
 
 
-def evaluation(eval_freq=1):
-    return EvalCallback(Monitor(make_env()), eval_freq=eval_freq, n_eval_episodes=1, verbose=0)
-
-
 @pytest.mark.parametrize("verbose", [0, 1])
 @pytest.mark.parametrize("algorithm", [DT, DTFM])
 def test_a_loaded_model_learns_with_evaluation_on_scored_data(algorithm, verbose, scored_buffer, tmp_path):
@@ -42,21 +38,9 @@ def test_a_loaded_model_learns_with_evaluation_on_scored_data(algorithm, verbose
     loaded = algorithm.load(tmp_path / "model", dataset=scored_buffer, verbose=verbose)
     assert loaded.score_reference == SCALE
     curves = record_curves(loaded)
-    loaded.learn(2, callback=evaluation(eval_freq=2))
+    loaded.learn(2, callback=EvalCallback(Monitor(make_env()), eval_freq=2, n_eval_episodes=1, verbose=0))
     ((_, mean_reward),) = curves.points["eval/mean_reward"]
     assert curves.points["eval/normalized_score"] == [(2, pytest.approx((mean_reward + 100.0) / 200.0))]
-
-
-@pytest.mark.parametrize("nested", [False, True])
-def test_a_normalised_score_is_logged_once_an_evaluation(nested, scored_buffer):
-    """Not at the steps between, of which there is no result; also where SB3's own event decides when to evaluate."""
-    model = make_model(DT, scored_buffer)
-    curves = record_curves(model)
-    event = EveryNTimesteps(4, evaluation())
-    model.learn(10, callback=CallbackList([event]) if nested else event)
-    rewards, scores = curves.points["eval/mean_reward"], curves.points["eval/normalized_score"]
-    assert [step for step, _ in rewards] == [4, 8]
-    assert scores == [(step, pytest.approx((reward + 100.0) / 200.0)) for step, reward in rewards]
 
 
 @pytest.mark.parametrize("algorithm", [DT, DTFM])

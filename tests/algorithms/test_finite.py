@@ -17,12 +17,14 @@ def infinite_parts(model) -> list[str]:
     return [name for name, values in state.items() if values.is_floating_point() and not th.isfinite(values).all()]
 
 
-@pytest.mark.parametrize("ema_decay", [0.0, 0.9])
 @pytest.mark.parametrize("log_interval", [None, 1, 1000])
 @pytest.mark.parametrize("algorithm", [DT, DTFM])
-def test_divergence_is_an_error_and_leaves_finite_weights(algorithm, log_interval, ema_decay, cheetah_buffer, tmp_path):
-    """Whether and how often training is logged does not matter, and callbacks never see a broken model."""
-    model = make_model(algorithm, cheetah_buffer, ema_decay=ema_decay, **DIVERGING)
+def test_divergence_is_an_error_and_leaves_finite_weights(algorithm, log_interval, cheetah_buffer, tmp_path):
+    """
+    Whether and how often training is logged does not matter, and callbacks never see a broken model: neither the weights
+    that are trained nor their moving average.
+    """
+    model = make_model(algorithm, cheetah_buffer, ema_decay=0.9, **DIVERGING)
     with pytest.raises(FloatingPointError, match="learning_rate"):
         model.learn(20, callback=CheckpointCallback(1, str(tmp_path)), log_interval=log_interval)
     assert 0 < model.num_timesteps < 20

@@ -91,6 +91,7 @@ def test_an_evaluation_in_between_leaves_a_plain_loop_alone(n_envs, model, episo
     assert hints() == []
 
 
+@pytest.mark.filterwarnings("ignore:.*state:UserWarning")
 def test_calls_with_a_state_or_an_episode_start_neither_read_nor_change_what_is_remembered(model, episodes):
     ours, theirs = episodes[:2]
     expected = act_alone(model, ours)
@@ -155,6 +156,7 @@ def test_two_environments_that_take_turns_with_their_own_states_act_as_alone(mod
     assert hints() == []
 
 
+@pytest.mark.filterwarnings("ignore:.*state:UserWarning")
 def test_reset_forgets(model, episodes):
     observations = episodes[0]
     for observation in observations[:4]:
