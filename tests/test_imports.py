@@ -26,8 +26,9 @@ ROOMS = {
         {"algorithms", "policies", "heads", "data", "envs", "windows", "arguments", "callbacks", "optimization", "distributed"},
     ),
     "zoo": ("sb3_dtfm/zoo", {"", "algorithms", "policies", "data", "envs", "distributed", "zoo"}),
-    "benchmark": ("sb3_dtfm/benchmark", {"", "data", "zoo", "benchmark", "cli"}),
-    "cli": ("sb3_dtfm/cli", {"", "data", "envs", "recording", "zoo", "benchmark", "cli"}),
+    "benchmark": ("sb3_dtfm/benchmark", {"algorithms", "data", "zoo", "benchmark", ""}),
+    "report": ("sb3_dtfm/benchmark/report", {"benchmark"}),
+    "cli": ("sb3_dtfm/cli", {"", "algorithms", "data", "envs", "recording", "zoo", "benchmark", "cli"}),
 }
 
 
