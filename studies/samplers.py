@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from sb3_dtfm import DTFM
 from sb3_dtfm.benchmark.evaluation import SeededEpisodes, evaluate
-from sb3_dtfm.benchmark.statistics import wilson
+from sb3_dtfm.benchmark.report.statistics import wilson
 from sb3_dtfm.envs import ReturnToGoWrapper
 
 # Name: solver, its steps, keys and values kept.

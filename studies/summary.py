@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_dtfm.benchmark.rows import merge_rows, result_files
-from sb3_dtfm.benchmark.runs import N_LATE, Run, group_runs, steps_to_success
+from sb3_dtfm.benchmark.report.runs import N_LATE, Run, read_studies, steps_to_success
 
 NONE = "-"
 HORIZON = 1000  # Steps of an episode of MuJoCo's tasks in which nobody falls.
@@ -44,7 +43,7 @@ def median_steps(run: Run) -> str:
 
 def lines(folder: Path) -> Iterable[dict[str, str]]:
     """One for each label, task, share of the data and algorithm."""
-    for group in group_runs(merge_rows(result_files([folder])))[0]:
+    for group in (group for study in read_studies([folder]) for group in study.groups):
         for (task, share, algo), runs in sorted(group.runs.items()):
             values = {
                 "late average": [measured(run, "late") for run in runs],

@@ -37,8 +37,8 @@ ROOMS = {
         },
     ),
     "zoo": ("sb3_dtfm/zoo", {"", "algorithms", "policies", "callbacks", "envs", "distributed", "zoo"}),
-    "benchmark": ("sb3_dtfm/benchmark", {"", "data", "zoo", "benchmark", "cli"}),
-    "cli": ("sb3_dtfm/cli", {"", "data", "envs", "recording", "zoo", "benchmark", "cli"}),
+    "benchmark": ("sb3_dtfm/benchmark", {"", "algorithms", "data", "zoo", "benchmark"}),
+    "cli": ("sb3_dtfm/cli", {"", "algorithms", "data", "envs", "recording", "zoo", "benchmark", "cli"}),
 }
 
 

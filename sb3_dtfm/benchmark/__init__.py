@@ -1,1 +1,1 @@
-"""DT against DTFM: a grid of training runs, their rows of results, and the report made from them."""
+"""Algorithms compared on a grid of training runs: what runs them and writes rows; `report` says what the rows say."""

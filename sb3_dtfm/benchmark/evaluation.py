@@ -1,19 +1,27 @@
-"""Evaluation on fixed initial states, during training and at its end."""
+"""Evaluation on fixed initial states: before, during and after training."""
 
+import re
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+from rl_zoo3.utils import create_test_env
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+
+from sb3_dtfm.benchmark import provenance
+from sb3_dtfm.benchmark.rows import Row, write_row
 
 # First seeds of the two sets of initial states: apart from each other, and from those of recordings, which count from 0.
 TRAINING_STATES = 1_000_000
 FINAL_STATES = 2_000_000
-PROGRESS_INTERVAL = 0.5  # seconds between two reports of progress
+# What a cell prints for the grid that reads its output: steps done, steps in all, what it is doing.
+PROGRESS = re.compile(r"step (\d+) of (\d+): (.*)\n")
+PROGRESS_INTERVAL = 0.5  # seconds
 
 
 class Episodes(NamedTuple):
@@ -51,6 +59,28 @@ class SeededEpisodes(gym.Wrapper):
         return self.env.reset(seed=self._seeds.pop(0) if self._seeds else seed, options=options)
 
 
+def make_seeded_envs(env_id: str, settings: dict[str, Any], n_envs: int, subprocesses: bool = False) -> VecEnv:
+    """
+    Environments as RL-Zoo makes them for a training run, in :class:`SeededEpisodes`.
+
+    :param env_id: Gymnasium id
+    :param settings: of the run; `env_wrapper`, `vec_env_wrapper` and `env_kwargs` count
+    :param n_envs: side by side
+    :param subprocesses: each in a process of its own
+    """
+    wrappers = settings.get("env_wrapper") or []
+    wrappers = [*(wrappers if isinstance(wrappers, list) else [wrappers]), SeededEpisodes]
+    hyperparams = {key: settings[key] for key in ("vec_env_wrapper",) if settings.get(key)}
+    return create_test_env(
+        env_id,
+        n_envs=n_envs,
+        should_render=False,
+        hyperparams={**hyperparams, "env_wrapper": wrappers},
+        env_kwargs=settings.get("env_kwargs"),
+        vec_env_cls=SubprocVecEnv if subprocesses else DummyVecEnv,
+    )
+
+
 def evaluate(
     model: BaseAlgorithm, vec_env: VecEnv, seeds: Sequence[int], after_step: Callable[[int], None] | None = None
 ) -> Episodes:
@@ -84,79 +114,89 @@ def evaluate(
         returns[starts], lengths[starts] = 0.0, 0
         if after_step is not None:
             after_step(len(results))
-    ordered = [results[episode] for episode in range(n_episodes)]
-    successes = [success for _, _, success in ordered]
-    return Episodes(
-        [each for each, _, _ in ordered],
-        [length for _, length, _ in ordered],
-        None if any(success is None for success in successes) else [bool(success) for success in successes],
-    )
+    all_returns, all_lengths, successes = map(list, zip(*(results[episode] for episode in range(n_episodes)), strict=True))
+    return Episodes(all_returns, all_lengths, None if None in successes else [bool(success) for success in successes])
 
 
 class EvaluationCallback(BaseCallback):
     """
-    Evaluate every `eval_freq` gradient steps and, on other initial states, after the last one.
+    Evaluate before the first gradient step, every `eval_freq` of them and after the last one, and write a row each time;
+    after the last one also on initial states of its own, which nobody could choose a model by.
 
-    :param vec_env: environments in :class:`SeededEpisodes`; closed at the end
+    A YAML file of RL-Zoo may name it under `callback:`; all arguments are plain data.
+
+    :param rows: JSONL file to append to
+    :param row: what all rows say: the cell, `settings` and `data`, see :mod:`~sb3_dtfm.benchmark.rows`
     :param eval_freq: gradient steps between two evaluations
     :param n_episodes: episodes of each
-    :param n_final_episodes: episodes of the evaluation at the end
-    :param write: takes what a row says of one evaluation: step, final, wall_s, steps_per_s, solver and the episodes
-    :param report_progress: takes gradient steps done and to do, and what is going on; called at most every half second
+    :param n_final_episodes: episodes of the last one, on the other initial states
+    :param n_envs: environments side by side
+    :param subprocesses: each in a process of its own
     """
 
     def __init__(
         self,
-        vec_env: VecEnv,
+        rows: str,
+        row: Row,
         eval_freq: int,
         n_episodes: int,
         n_final_episodes: int,
-        write: Callable[[dict[str, Any]], None],
-        report_progress: Callable[[int, int, str], None],
+        n_envs: int = 1,
+        subprocesses: bool = False,
     ) -> None:
         super().__init__()
-        self.vec_env = vec_env
+        self.rows = Path(rows)
+        self.row = {**row, "commit": provenance.commit(), "versions": provenance.versions()}
         self.eval_freq = eval_freq
         self.n_episodes = n_episodes
         self.n_final_episodes = n_final_episodes
-        self.write = write
-        self.report_progress = report_progress
+        self.n_envs = n_envs
+        self.subprocesses = subprocesses
         self._resumed, self._training_seconds, self._reported = 0.0, 0.0, 0.0
+
+    def _init_callback(self) -> None:
+        self.vec_env = make_seeded_envs(self.row["task"], self.row["settings"], self.n_envs, self.subprocesses)
 
     def _on_training_start(self) -> None:
         self._resumed = time.perf_counter()
+        self._evaluate(final=False)
 
     def _on_step(self) -> bool:
         self._report("training")
         last = self.num_timesteps == self.model._total_timesteps
-        if self.num_timesteps % self.eval_freq == 0:
-            self._evaluate(TRAINING_STATES, self.n_episodes, final=False)
+        if last or self.num_timesteps % self.eval_freq == 0:
+            self._evaluate(final=False)
         if last:
-            self._evaluate(FINAL_STATES, self.n_final_episodes, final=True)
+            self._evaluate(final=True)
         return True
 
     def _on_training_end(self) -> None:
         self.vec_env.close()
 
-    def _evaluate(self, first_seed: int, n_episodes: int, final: bool) -> None:
+    def _evaluate(self, final: bool) -> None:
         self._training_seconds += time.perf_counter() - self._resumed
-        what = "final evaluation" if final else "evaluation"
-        seeds = range(first_seed, first_seed + n_episodes)
+        first, n_episodes = (FINAL_STATES, self.n_final_episodes) if final else (TRAINING_STATES, self.n_episodes)
+        what = f"{'final ' if final else ''}evaluation"
+        seeds = range(first, first + n_episodes)
         episodes = evaluate(self.model, self.vec_env, seeds, lambda n_done: self._report(f"{what} {n_done}/{n_episodes}"))
-        self.write(
-            dict(
-                step=self.num_timesteps,
-                final=final,
-                **episodes._asdict(),
-                solver=getattr(self.model.policy, "solver", None),
-                n_solver_steps=getattr(self.model.policy, "n_solver_steps", None),
-                wall_s=round(self._training_seconds, 3),
-                steps_per_s=round(self.num_timesteps / self._training_seconds, 3),
-            )
+        evaluation = dict(
+            step=self.num_timesteps,
+            final=final,
+            **episodes._asdict(),
+            **{name: self.model.policy.acting_settings().get(name) for name in ("solver", "n_solver_steps")},
+            wall_s=round(self._training_seconds, 3),
+            steps_per_s=round(self.num_timesteps / self._training_seconds, 3),
+            hardware=provenance.hardware(self.model.device),
         )
+        write_row(self.rows, {**self.row, **evaluation})
         self._resumed = time.perf_counter()
 
     def _report(self, what: str) -> None:
+        """
+        Say how far the cell is. Where the grid that reads it is gone, the pipe is broken, and the cell ends with it.
+
+        :raises BrokenPipeError: nobody would take the rows
+        """
         if time.monotonic() - self._reported >= PROGRESS_INTERVAL:
             self._reported = time.monotonic()
-            self.report_progress(self.num_timesteps, self.model._total_timesteps, what)
+            print(f"step {self.num_timesteps} of {self.model._total_timesteps}: {what}", flush=True)

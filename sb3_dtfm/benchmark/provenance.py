@@ -1,8 +1,10 @@
 """Where a row comes from: the code, the machine, and the data."""
 
+import contextlib
 import json
 import os
 import platform
+import re
 import subprocess
 from importlib import metadata
 from pathlib import Path
@@ -22,32 +24,25 @@ GIT_TIMEOUT = 20  # seconds
 
 def commit() -> str | None:
     """Commit of this package's sources, with "-dirty" if they were changed since; None outside a git checkout."""
-    folder = Path(sb3_dtfm.__file__).parent
-    head = _git(folder, "rev-parse", "HEAD")
-    tracked = head and _git(folder, "ls-files", "--error-unmatch", Path(sb3_dtfm.__file__).name)
-    if not tracked:  # a package inside someone else's repository is not of its commit
-        return None
-    changed = _git(folder, "status", "--porcelain", "--untracked-files=no", ":/")
-    return f"{head}-dirty" if changed else head
+    source = Path(sb3_dtfm.__file__)
 
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(source.parent), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, timeout=GIT_TIMEOUT, check=True).stdout.strip()
 
-def _git(folder: Path, *arguments: str) -> str | None:
-    command = ["git", "-C", str(folder), *arguments]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=GIT_TIMEOUT, check=True)
+        git("ls-files", "--error-unmatch", source.name)  # a package inside someone else's repository is not of its commit
+        return git("rev-parse", "HEAD") + ("-dirty" if git("status", "--porcelain", "--untracked-files=no", ":/") else "")
     except (OSError, subprocess.SubprocessError):
         return None
-    return done.stdout.strip()
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that results depend on."""
+    """Versions of Python and of the packages that results depend on, as far as they are installed."""
     found = {"python": platform.python_version()}
     for package in PACKAGES:
-        try:
+        with contextlib.suppress(metadata.PackageNotFoundError):
             found[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            continue
     return found
 
 
@@ -72,11 +67,8 @@ def n_cores() -> int:
 
 def _cpu_name() -> str:
     info = Path("/proc/cpuinfo")
-    if info.is_file():
-        names = [line.partition(":")[2].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
-        if names:
-            return names[0]
-    return platform.processor() or platform.machine()
+    found = re.search(r"^model name\s*: (.*)$", info.read_text(), re.MULTILINE) if info.is_file() else None
+    return found[1] if found else platform.processor() or platform.machine()
 
 
 def describe_data(dataset: str, dataset_kwargs: dict[str, Any], recorded_from: str | None = None) -> dict[str, Any]:

@@ -6,30 +6,19 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
-# Key of a row: the types that its value may have. `bool` is an `int` to Python, so it is told apart in `_has_type`.
+# Key of a row: the types that its value may have.
 KEYS: dict[str, tuple[type, ...]] = {
-    "task": (str,),
-    "regime": (float, int),
-    "algo": (str,),
-    "seed": (int,),
-    "profile": (str,),
-    "label": (str,),
-    "step": (int,),
+    **dict.fromkeys(("task", "algo", "profile", "label"), (str,)),
+    **dict.fromkeys(("regime", "wall_s", "steps_per_s"), (float, int)),
+    **dict.fromkeys(("seed", "step"), (int,)),
     "final": (bool,),
-    "returns": (list,),
-    "lengths": (list,),
+    **dict.fromkeys(("returns", "lengths"), (list,)),
     "successes": (list, type(None)),
-    "solver": (str, type(None)),
     "n_solver_steps": (int, type(None)),
-    "wall_s": (float, int),
-    "steps_per_s": (float, int),
-    "commit": (str, type(None)),
-    "versions": (dict,),
-    "hardware": (dict,),
-    "settings": (dict,),
-    "data": (dict,),
+    **dict.fromkeys(("solver", "commit"), (str, type(None))),
+    **dict.fromkeys(("versions", "hardware", "settings", "data"), (dict,)),
 }
-EPISODE_KEYS = ("returns", "lengths", "successes")
+EPISODE_KEYS: dict[str, tuple[type, ...]] = {"returns": (float, int), "lengths": (float, int), "successes": (bool,)}
 
 Row = dict[str, Any]
 
@@ -66,12 +55,16 @@ class Cell(NamedTuple):
     def file_name(self) -> str:
         """Name for files and folders of this cell: no separators, no spaces."""
         parts = [self.task, f"{self.regime:g}", self.algo, f"seed{self.seed}", self.profile, self.label]
-        name = "_".join(part for part in parts if part)
-        return "".join(letter if letter.isalnum() or letter in "._-" else "-" for letter in name)
+        return plain_name("_".join(part for part in parts if part))
 
     def __str__(self) -> str:
         label = f", {self.label}" if self.label else ""
         return f"{self.task}, {self.regime:.0%} of the data, {self.algo}, seed {self.seed}, {self.profile}{label}"
+
+
+def plain_name(text: str) -> str:
+    """The text as a file name: no separators, no spaces."""
+    return "".join(letter if letter.isalnum() or letter in "._-" else "-" for letter in text)
 
 
 def check_row(row: Any) -> Row:
@@ -85,38 +78,29 @@ def check_row(row: Any) -> Row:
     missing, unknown = [key for key in KEYS if key not in row], sorted(set(row) - set(KEYS))
     if missing or unknown:
         found = [f"lacks {', '.join(missing)}"] if missing else []
-        found += [f"has the unknown {', '.join(map(str, unknown))}"] if unknown else []
+        found += [f"has the unknown {', '.join(unknown)}"] if unknown else []
         raise RowError(f"{' and '.join(found)}; expected are {', '.join(KEYS)}.")
     for key, types in KEYS.items():
-        if not _has_type(row[key], types):
-            expected = " or ".join("null" if each is type(None) else each.__name__ for each in types)
-            raise RowError(f"{key} is {row[key]!r}, expected {expected}.")
-    _check_episodes(row)
+        _check_type(f"{key} is", row[key], types)
+    episodes = {key: row[key] for key in EPISODE_KEYS if row[key] is not None}
+    for key, values in episodes.items():
+        for value in values:
+            _check_type(f"{key} holds", value, EPISODE_KEYS[key])
+    if len({len(values) for values in episodes.values()}) != 1 or not row["returns"]:
+        counts = ", ".join(f"{len(values)} {key}" for key, values in episodes.items())
+        raise RowError(f"holds {counts}, expected one of each for every episode, and at least one episode.")
     if not 0.0 < row["regime"] <= 1.0:
         raise RowError(f"regime is {row['regime']!r}, expected a number in (0, 1].")
     return row
 
 
-def _check_episodes(row: Row) -> None:
+def _check_type(what: str, value: Any, types: tuple[type, ...]) -> None:
     """
-    :raises RowError: the lists differ in length, are empty, or hold something else than numbers
+    :raises RowError: another type; exactly these, as a `bool` is an `int` to Python
     """
-    lists = {key: row[key] for key in EPISODE_KEYS if row[key] is not None}
-    lengths = {key: len(values) for key, values in lists.items()}
-    if len(set(lengths.values())) != 1 or 0 in lengths.values():
-        found = ", ".join(f"{n} {key}" for key, n in lengths.items())
-        raise RowError(f"holds {found}, expected one of each for every episode, and at least one episode.")
-    for key, values in lists.items():
-        expected = (bool,) if key == "successes" else (int, float)
-        wrong = [value for value in values if not _has_type(value, expected)]
-        if wrong:
-            raise RowError(f"{key} holds {wrong[0]!r}, expected {' or '.join(each.__name__ for each in expected)}.")
-
-
-def _has_type(value: Any, types: tuple[type, ...]) -> bool:
-    if isinstance(value, bool):
-        return bool in types
-    return isinstance(value, types)
+    if type(value) not in types:
+        expected = " or ".join("null" if each is type(None) else each.__name__ for each in types)
+        raise RowError(f"{what} {value!r}, expected {expected}.")
 
 
 def write_row(path: Path, row: Row) -> None:
@@ -134,10 +118,9 @@ def read_rows(path: Path) -> list[Row]:
     rows = []
     with path.open() as file:
         for number, line in enumerate(file, start=1):
-            if not line.strip():
-                continue
             try:
-                rows.append(check_row(json.loads(line, parse_constant=_refuse)))
+                if line.strip():
+                    rows.append(check_row(json.loads(line, parse_constant=_refuse)))
             except json.JSONDecodeError as error:
                 raise RowError(f"{path}, line {number}: is not JSON ({error.msg}); expected one object a line.") from error
             except RowError as error:
@@ -152,18 +135,21 @@ def _refuse(constant: str) -> NoReturn:
     raise RowError(f"holds {constant}, expected numbers.")
 
 
-def result_files(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
+def result_files(paths: Iterable[str | os.PathLike[str]]) -> dict[str, list[Path]]:
     """
-    Files of rows: those named, and `*.jsonl` of the folders named.
+    Files of rows by study: a folder below one that is named is a study, what was named itself is the study "".
 
+    :param paths: files, and folders with `*.jsonl` in them or below them
     :raises FileNotFoundError: one of them does not exist
     """
-    files: list[Path] = []
+    studies: dict[str, list[Path]] = {}
     for path in map(Path, paths):
         if not path.exists():
             raise FileNotFoundError(f"{path} does not exist; expected a folder or a file that `sb3-dtfm benchmark` wrote.")
-        files += sorted(path.glob("*.jsonl")) if path.is_dir() else [path]
-    return files
+        for file in sorted(path.rglob("*.jsonl")) if path.is_dir() else [path]:
+            study = file.parent.relative_to(path).as_posix() if path.is_dir() else "."
+            studies.setdefault("" if study == "." else study, []).append(file)
+    return studies
 
 
 def merge_rows(files: Sequence[Path]) -> list[Row]:
@@ -176,12 +162,10 @@ def merge_rows(files: Sequence[Path]) -> list[Row]:
     for path in files:
         for row in read_rows(path):
             key = (Cell.of(row), row["step"], row["final"])
-            if key in rows and rows[key][0] != row:
-                where = f"{rows[key][1]} and {path}"
-                raise RowError(
-                    f"{where}: different results of {key[0]}, step {key[1]}; keep one run of it, or give it a label."
-                )
-            rows.setdefault(key, (row, path))
+            known, where = rows.setdefault(key, (row, path))
+            if known != row:
+                what = f"different results of {key[0]}, step {key[1]}; keep one run of it, or give it a label."
+                raise RowError(f"{where} and {path}: {what}")
     return [row for row, _ in rows.values()]
 
 

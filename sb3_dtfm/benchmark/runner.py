@@ -1,7 +1,7 @@
-"""Runs the cells of the grid, each in a process of its own."""
+"""Runs the cells of a grid, each as `sb3-dtfm train` in a process of its own."""
 
 import argparse
-import json
+import contextlib
 import os
 import shutil
 import signal
@@ -10,52 +10,25 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
+from datetime import timedelta
 from pathlib import Path
-from typing import Any, NoReturn
+from threading import Lock
+from typing import Any
 
 import yaml
 from filelock import FileLock, Timeout
+from tqdm import tqdm
 
-from sb3_dtfm.benchmark.cell import OUTPUT, PROGRESS, ROWS, SPEC
-from sb3_dtfm.benchmark.display import Clock, Display, duration, make_display
-from sb3_dtfm.benchmark.grid import Job, parse_arguments, plan
+from sb3_dtfm.benchmark.evaluation import PROGRESS
+from sb3_dtfm.benchmark.grid import Job
 from sb3_dtfm.benchmark.provenance import n_cores
 from sb3_dtfm.benchmark.rows import RowError, finished_cells, read_rows
 
-CELL_MODULE = "sb3_dtfm.benchmark.cell"
-POLL_INTERVAL = 0.2  # seconds
+TRAIN = [sys.executable, "-m", "sb3_dtfm", "train"]
+CALLBACK = "sb3_dtfm.benchmark.evaluation.EvaluationCallback"
+ROWS, SETTINGS, OUTPUT = "rows.jsonl", "settings.yml", "output.log"
 PATIENCE = 10.0  # seconds that a process has to end after SIGTERM
-
-
-@dataclass
-class RunningCell:
-    """A cell whose process is running."""
-
-    job: Job
-    folder: Path
-    process: subprocess.Popen[bytes]
-    lock: FileLock
-    start: float
-
-    def progress(self) -> tuple[int, int, str]:
-        """Gradient steps done, gradient steps in all, and what is going on."""
-        try:
-            n_done, n_steps, what = json.loads((self.folder / PROGRESS).read_text())
-        except FileNotFoundError:
-            return 0, self.job.n_steps, "starting"
-        return n_done, n_steps, what
-
-    def end(self) -> None:
-        """End the process and those that it started for its environments."""
-        if self.process.poll() is None:
-            os.killpg(self.process.pid, signal.SIGTERM)
-            try:
-                self.process.wait(PATIENCE)
-            except subprocess.TimeoutExpired:
-                os.killpg(self.process.pid, signal.SIGKILL)
-                self.process.wait()
-        self.lock.release()
 
 
 class Runner:
@@ -63,162 +36,183 @@ class Runner:
     Keeps `--jobs` cells running until none is left.
 
     :param jobs: cells to run, in this order
-    :param options: of :func:`~sb3_dtfm.benchmark.grid.parse_arguments`
+    :param options: arguments of `sb3-dtfm benchmark`
     """
 
     def __init__(self, jobs: Sequence[Job], options: argparse.Namespace) -> None:
-        self.pending = list(jobs)
+        self.jobs = jobs
         self.options = options
         self.results = Path(options.results)
-        self.logs = Path(options.log_folder)
-        self.running: list[RunningCell] = []
-        self.failed: list[Path] = []
-        self.skipped: list[Job] = []
-        self.n_jobs, self.n_done = len(self.pending), 0
-        self._steps_done = 0
-        self._clock = Clock(sum(job.n_steps for job in jobs))
+        self.done: list[Job] = []
+        self.failed: list[Path] = []  # their logs
+        self.left: list[Job] = []  # to another call of the command
+        share = max(1, n_cores() // options.jobs)
+        given = os.environ.get("OMP_NUM_THREADS", "")
+        self._n_threads = min(share, int(given)) if given.isdigit() and int(given) > 0 else share
+        self._processes: list[subprocess.Popen[str]] = []
+        self._lock = Lock()
+        self._stopping = False
+        self._bar = _bar("grid", sum(job.n_steps for job in jobs))
 
     def run(self) -> None:
-        """Run all cells; one that fails does not stop the others."""
-        self.results.mkdir(parents=True, exist_ok=True)
-        with make_display(self.n_jobs) as display:
+        """Run all cells; one that fails does not stop the others, an interrupt ends them."""
+        (self.results / ".locks").mkdir(parents=True, exist_ok=True)
+        with self._bar, ThreadPoolExecutor(self.options.jobs) as pool:
+            cells = [pool.submit(self._run_cell, job) for job in self.jobs]
             try:
-                while self.pending or self.running:
-                    while self.pending and len(self.running) < self.options.jobs:
-                        self._start(self.pending.pop(0), display)
-                    for cell in [cell for cell in self.running if cell.process.poll() is not None]:
-                        self.running.remove(cell)
-                        self._finish(cell, display)
-                    self._show(display)
-                    if self.running:
-                        time.sleep(POLL_INTERVAL)
+                for cell in as_completed(cells):
+                    cell.result()
             finally:
-                for cell in self.running:
-                    cell.end()
+                pool.shutdown(wait=False, cancel_futures=True)
+                self._end_processes()
 
-    def _start(self, job: Job, display: Display) -> None:
-        """Start a cell, unless another call of the command is at it or has finished it meanwhile."""
+    def _run_cell(self, job: Job) -> None:
+        """Run a cell, unless another call of the command is at it or has finished it meanwhile."""
         name = job.cell.file_name
-        locks = self.results / ".locks"
-        locks.mkdir(exist_ok=True)
-        lock = FileLock(locks / f"{name}.lock")
         try:
-            lock.acquire(timeout=0)
+            with FileLock(self.results / ".locks" / f"{name}.lock").acquire(timeout=0):
+                if (self.results / f"{name}.jsonl").exists():
+                    self.done.append(job)
+                else:
+                    self._train(job, self._prepare(job))
         except Timeout:
-            display.say(f"{job.cell}: another process is running it")
-            self.skipped.append(job)
-            return
-        if (self.results / f"{name}.jsonl").exists():
-            lock.release()
-            self.n_done += 1
-            return
-        shutil.rmtree(self.logs / name, ignore_errors=True)
-        (self.logs / name).mkdir(parents=True, exist_ok=True)
-        # A folder for each attempt: what a killed grid leaves behind may still be writing into its own.
-        folder = Path(tempfile.mkdtemp(prefix="attempt-", dir=self.logs / name))
-        (folder / SPEC).write_text(json.dumps(self._spec(job, folder)))
-        (folder / "settings.yml").write_text(yaml.safe_dump({job.cell.task: job.settings}))
-        command = [sys.executable, "-m", CELL_MODULE, str(folder / SPEC)]
+            _say(f"{job.cell}: another process is running it")
+            self.left.append(job)
+
+    def _prepare(self, job: Job) -> Path:
+        """A folder with a cell's settings, new for each attempt: an orphan may still be writing into an older one."""
+        logs, options = Path(self.options.log_folder) / job.cell.file_name, self.options
+        shutil.rmtree(logs, ignore_errors=True)
+        logs.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(prefix="attempt-", dir=logs))
+        arguments = {
+            "rows": str(folder / ROWS),
+            "row": {**job.cell._asdict(), "settings": job.settings, "data": job.data},
+            "eval_freq": job.eval_freq,
+            "n_episodes": options.eval_episodes,
+            "n_final_episodes": options.final_episodes,
+            "n_envs": options.n_eval_envs,
+            "subprocesses": options.vec_env == "subproc",
+        }
+        own = job.settings.get("callback") or []
+        callbacks = [*(own if isinstance(own, list) else [own]), {CALLBACK: arguments}]
+        (folder / SETTINGS).write_text(yaml.safe_dump({job.cell.task: {**job.settings, "callback": callbacks}}))
+        return folder
+
+    def _train(self, job: Job, folder: Path) -> None:
+        start = time.monotonic()
+        with self._start(job, folder) as process:
+            n_started = self._processes.index(process) + 1
+            _say(f"[{n_started}/{len(self.jobs)}] {job.cell}: {job.n_steps:,} gradient steps")
+            self._follow(process, job, folder / OUTPUT)
+        took = timedelta(seconds=round(time.monotonic() - start))
+        if process.returncode == 0 and self._publish(job, folder / ROWS):
+            self.done.append(job)
+            _say(f"{job.cell}: done in {took}")
+        elif not self._stopping:
+            self.failed.append(folder / OUTPUT)
+            _say(f"{job.cell}: FAILED after {took}, see {folder / OUTPUT}")
+
+    def _start(self, job: Job, folder: Path) -> subprocess.Popen[str]:
+        """
+        The cell's process.
+
+        :raises CancelledError: the grid is being ended
+        """
+        command = [*TRAIN, "--algo", job.cell.algo, "--env", job.cell.task, "--seed", str(job.cell.seed)]
+        command += ["--conf-file", str(folder / SETTINGS), "--log-folder", str(folder / "logs"), "--eval-freq", "-1"]
+        command += ["--verbose", "0", "--device", self.options.device, "--num-threads", str(self._n_threads)]
         environment = {key: value for key, value in os.environ.items() if key not in ("RANK", "WORLD_SIZE")}
-        environment["OMP_NUM_THREADS"] = str(self._n_threads())
-        with (folder / OUTPUT).open("wb") as output:
-            # A session of its own: Ctrl-C would have RL-Zoo save the model and end as if all were well.
+        environment["OMP_NUM_THREADS"] = str(self._n_threads)
+        # A session of its own: Ctrl-C would have RL-Zoo save the model and end as if all were well.
+        pipes: dict[str, Any] = dict(stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        with self._lock:
+            if self._stopping:
+                raise CancelledError
             process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, env=environment, start_new_session=True
+                command, **pipes, text=True, errors="replace", env=environment, start_new_session=True
             )
-        self.running.append(RunningCell(job, folder, process, lock, time.monotonic()))
-        display.say(f"[{self._n_started()}/{self.n_jobs}] {job.cell}: {job.n_steps:,} gradient steps")
+            self._processes.append(process)
+        return process
 
-    def _n_started(self) -> int:
-        return self.n_jobs - len(self.pending)
+    def _follow(self, process: subprocess.Popen[str], job: Job, log: Path) -> None:
+        """Show how far the cell is, and keep what else it prints, until it ends."""
+        assert process.stdout is not None
+        cell = job.cell
+        name = f"{cell.task} {cell.regime:.0%} {cell.algo} seed {cell.seed} {cell.label}".strip()
+        with log.open("w", buffering=1) as file, _bar(name, job.n_steps) as bar:
+            for line in process.stdout:
+                found = PROGRESS.fullmatch(line)
+                if found is None:
+                    file.write(line)
+                    continue
+                bar.set_postfix_str(found[3], refresh=False)
+                self._bar.set_postfix_str(f"{len(self.done)} of {len(self.jobs)} cells", refresh=False)
+                n_new = int(found[1]) - bar.n
+                bar.update(n_new)
+                self._bar.update(n_new)
+            self._bar.update(job.n_steps - bar.n)
 
-    def _n_threads(self) -> int:
-        share = max(1, n_cores() // self.options.jobs)
-        given = os.environ.get("OMP_NUM_THREADS", "")
-        return min(share, int(given)) if given.isdigit() and int(given) > 0 else share
-
-    def _spec(self, job: Job, folder: Path) -> dict[str, Any]:
-        """What the cell's process reads."""
-        cell, options = job.cell, self.options
-        train = ["--algo", cell.algo, "--env", cell.task, "--seed", str(cell.seed)]
-        train += ["--conf-file", str(folder / "settings.yml"), "--log-folder", str(folder / "logs"), "--verbose", "0"]
-        train += ["--eval-freq", str(job.eval_freq), "--eval-episodes", str(options.eval_episodes)]
-        train += ["--n-eval-envs", str(options.n_eval_envs), "--vec-env", options.vec_env, "--device", options.device]
-        train += ["--num-threads", str(self._n_threads())]
-        if options.env_kwargs:
-            train += ["--env-kwargs", *options.env_kwargs]
-        row = {**cell._asdict(), "settings": job.settings, "data": job.data}
-        return {"train": train, "row": row, "final_episodes": options.final_episodes, "parent": os.getpid()}
-
-    def _finish(self, cell: RunningCell, display: Display) -> None:
-        """Publish the rows of a cell whose process has ended, or note that it failed."""
-        self._steps_done += cell.job.n_steps
-        took = duration(time.monotonic() - cell.start)
-        try:
-            if cell.process.returncode == 0 and self._publish(cell):
-                self.n_done += 1
-                display.say(f"{cell.job.cell}: done in {took}")
-            else:
-                self.failed.append(cell.folder / OUTPUT)
-                display.say(f"{cell.job.cell}: FAILED after {took}, see {cell.folder / OUTPUT}")
-        finally:
-            cell.lock.release()
-
-    def _publish(self, cell: RunningCell) -> bool:
+    def _publish(self, job: Job, rows: Path) -> bool:
         """Make the rows appear in the results all at once; False if the final evaluation is not among them."""
-        part = cell.folder / ROWS
         try:
-            rows = read_rows(part) if part.exists() else []
-        except RowError:
+            if job.cell not in finished_cells(read_rows(rows)):
+                return False
+        except (FileNotFoundError, RowError):
             return False
-        if cell.job.cell not in finished_cells(rows):
-            return False
-        name = f"{cell.job.cell.file_name}.jsonl"
-        beside = self.results / f".{name}.part"  # the logs may lie in another file system
-        shutil.copyfile(part, beside)
-        beside.replace(self.results / name)
+        beside = self.results / f".{job.cell.file_name}.part"  # the logs may lie in another file system
+        shutil.copyfile(rows, beside)
+        beside.replace(self.results / f"{job.cell.file_name}.jsonl")
         return True
 
-    def _show(self, display: Display) -> None:
-        running = {cell.job.cell: cell.progress() for cell in self.running}
-        n_steps = self._steps_done + sum(step for step, _, _ in running.values())
-        display.update(self.n_done, self._clock.remaining(n_steps), running)
+    def _end_processes(self) -> None:
+        """End the cells and what they started for their environments."""
+        with self._lock:
+            self._stopping = True
+        running = [process for process in self._processes if process.poll() is None]
+        for process in running:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGTERM)
+        for process in running:
+            try:
+                process.wait(PATIENCE)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
 
 
-def main(argv: Sequence[str]) -> None:
+def _bar(name: str, n_steps: int) -> tqdm:
+    """Gradient steps and the time to go; without a terminal it shows once a minute."""
+    return tqdm(desc=name, total=n_steps, leave=False, smoothing=0, mininterval=0.5 if sys.stderr.isatty() else 60.0)
+
+
+def _say(message: str) -> None:
+    """A line that stays."""
+    tqdm.write(message)
+    sys.stdout.flush()
+
+
+def run_grid(jobs: Sequence[Job], n_finished: int, options: argparse.Namespace) -> None:
     """
-    Run `sb3-dtfm benchmark`.
+    Run what is left of a grid, and say what became of it.
 
-    :param argv: its arguments
+    :param jobs: cells to run
+    :param n_finished: cells that are not to be run again
+    :param options: arguments of `sb3-dtfm benchmark`
     :raises SystemExit: with code 1 if a cell failed or was left to another process, 130 if interrupted
     """
-    options = parse_arguments(argv)
-    jobs, done = plan(options)
-    print(f"{len(jobs)} cells to run, {len(done)} finished already in {options.results}", flush=True)
+    print(f"{len(jobs)} cells to run, {n_finished} finished already in {options.results}", flush=True)
     runner = Runner(jobs, options)
-    before = signal.signal(signal.SIGTERM, _interrupt)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         runner.run()
     except KeyboardInterrupt:
-        print(f"Interrupted after {runner.n_done} of {len(jobs)} cells; the same command goes on.", flush=True)
+        print(f"Interrupted after {len(runner.done)} of {len(jobs)} cells; the same command goes on.", flush=True)
         raise SystemExit(130) from None
     finally:
         signal.signal(signal.SIGTERM, before)
-    if runner.failed or runner.skipped:
-        print(f"{len(runner.failed)} of {len(jobs)} cells failed, {len(runner.skipped)} are left to other processes.")
+    if runner.failed or runner.left:
+        print(f"{len(runner.failed)} of {len(jobs)} cells failed, {len(runner.left)} are left to other processes.")
         for log in runner.failed:
-            print(f"{log}: {_last_line(log)}")
+            print(f"{log}: {(log.read_text().strip().splitlines() or ['nothing was written'])[-1]}")
         raise SystemExit(1)
-    print(f"All {len(jobs) + len(done)} cells are finished: sb3-dtfm report {options.results}", flush=True)
-
-
-def _interrupt(*_: Any) -> NoReturn:
-    """
-    :raises KeyboardInterrupt: on which the running cells are ended
-    """
-    raise KeyboardInterrupt
-
-
-def _last_line(log: Path) -> str:
-    lines = log.read_text(errors="replace").strip().splitlines()
-    return lines[-1] if lines else "nothing was written"
+    print(f"All {len(jobs) + n_finished} cells are finished: sb3-dtfm report {options.results}", flush=True)

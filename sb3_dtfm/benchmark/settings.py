@@ -3,20 +3,19 @@
 import copy
 import difflib
 import inspect
-from functools import cache
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import yaml
 
-from sb3_dtfm import DT, DTFM
+from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.zoo.arguments import UsageError
-from sb3_dtfm.zoo.registration import OFFLINE_ALGORITHMS, packaged_config
+from sb3_dtfm.zoo.registration import packaged_config, policy_of
 
 WRAPPER = "sb3_dtfm.envs.ReturnToGoWrapper"
 PROFILES = {"paper": None, "small": "small"}
-POLICIES = {"dt": DT.policy_aliases["MultiInputPolicy"], "dtfm": DTFM.policy_aliases["MultiInputPolicy"]}
 # Keys of the grid; a profile or `-params` that sets them would contradict it.
 GRID_KEYS = ("dataset_fraction", "dataset_seed", "seed")
 # Keys that RL-Zoo takes for itself; the others go to the constructor.
@@ -53,13 +52,29 @@ def profile_name(profile: str) -> str:
     return profile if profile in PROFILES else Path(profile).stem
 
 
-def read_profile(profile: str, algo: str) -> dict[str, dict[str, Any]]:
+def read_yaml(path: Path) -> dict[str, Any]:
     """
-    Settings by task, as the YAML holds them.
+    A mapping by task.
 
-    :param profile: "small", "paper", a YAML file for both algorithms, or a folder with dt.yml and dtfm.yml
-    :param algo: "dt" or "dtfm"
-    :raises UsageError: no such file, or it holds no mapping of tasks
+    :raises UsageError: no YAML, or something else in it
+    """
+    try:
+        content = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise UsageError(f"{path}: is not YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(content, dict):
+        raise UsageError(f"{path}: expected a mapping by task, found {content!r:.40}.")
+    return {str(task): value for task, value in content.items()}
+
+
+def read_profile(profile: str, algo: str, env_id: str) -> dict[str, Any]:
+    """
+    Settings of one task, or those for any other.
+
+    :param profile: "small", "paper", a YAML file for all algorithms, or a folder with one for each
+    :param algo: for example "dtfm"
+    :param env_id: Gymnasium id
+    :raises UsageError: no such file, or it holds no settings for the task
     """
     if profile in PROFILES:
         path = packaged_config(algo, PROFILES[profile])
@@ -67,13 +82,11 @@ def read_profile(profile: str, algo: str) -> dict[str, dict[str, Any]]:
         path = Path(profile) / f"{algo}.yml" if Path(profile).is_dir() else Path(profile)
     if not path.is_file():
         raise UsageError(f"--profile {profile}: {path} does not exist; expected small, paper, a YAML file or a folder.")
-    try:
-        settings = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
-        raise UsageError(f"{path}: is not YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(settings, dict) or not all(isinstance(value, dict) for value in settings.values()):
-        raise UsageError(f"{path}: expected a mapping from tasks (or `default`) to settings.")
-    return settings
+    profiles = read_yaml(path)
+    settings = profiles.get(env_id, profiles.get("default"))
+    if not isinstance(settings, dict):
+        raise UsageError(f"--profile {profile}: has neither settings for {env_id} nor a `default`.")
+    return copy.deepcopy(settings)
 
 
 def task_settings(
@@ -82,31 +95,24 @@ def task_settings(
     """
     Everything that RL-Zoo's `train` is to read for one cell, but the seed.
 
-    Head settings that only the other algorithm knows are left out, so that one file or one `-params` serves both.
+    Settings that only another algorithm knows are left out, so that one file or one `-params` serves all.
 
     :param profile: see :func:`read_profile`
-    :param algo: "dt" or "dtfm"
+    :param algo: for example "dtfm"
     :param task: the task and its data
     :param regime: share of the episodes
     :param n_timesteps: gradient steps, None for the profile's
     :param hyperparams: replace the profile's; `policy_kwargs` replace entry by entry
     :raises UsageError: settings missing, unknown or not allowed here
     """
-    profiles = read_profile(profile, algo)
-    if task.env_id not in profiles and "default" not in profiles:
-        raise UsageError(f"--profile {profile}: has neither settings for {task.env_id} nor a `default`.")
-    settings = copy.deepcopy(profiles.get(task.env_id, profiles.get("default", {})))
+    settings = read_profile(profile, algo, task.env_id)
     policy_kwargs = {**_policy_kwargs(settings), **_policy_kwargs(hyperparams)}
     settings.update(hyperparams)
     for key in GRID_KEYS:
         if key in settings:
             raise UsageError(f"{key}: the grid sets it; leave it out of the profile and of -params.")
-    settings["policy_kwargs"] = _known(policy_kwargs, algo, _policy_parameters)
     settings = _known(settings, algo, _constructor_parameters)
-    unknown = set(settings["policy_kwargs"]) - _policy_parameters(algo)
-    unknown |= set(settings) - _constructor_parameters(algo) - ZOO_KEYS
-    if unknown:
-        raise UsageError(f"{', '.join(sorted(map(str, unknown)))}: no setting of {algo} (--profile {profile}, -params).")
+    settings["policy_kwargs"] = _known(policy_kwargs, algo, _policy_parameters)
     if task.dataset is not None:
         settings["dataset"] = task.dataset
     if task.target_return is not None:
@@ -127,20 +133,19 @@ def task_settings(
 
 def check_same_trunk(settings: dict[str, dict[str, Any]], task: str) -> None:
     """
-    DT and DTFM may differ in what only one of them knows, and in nothing else.
+    Algorithms may differ in what not all of them know, and in nothing else.
 
-    :param settings: by algorithm
+    :param settings: by algorithm, of all algorithms
     :param task: for the message
     :raises UsageError: names what differs
     """
-    if set(settings) != set(OFFLINE_ALGORITHMS):
-        return
     flat = {algo: {**each, **_policy_kwargs(each)} for algo, each in settings.items()}
-    own = _only_of("dtfm", _policy_parameters) | _only_of("dtfm", _constructor_parameters) | {"policy_kwargs"}
-    for key in sorted((set(flat["dt"]) | set(flat["dtfm"])) - own):
-        values = [flat[algo].get(key) for algo in ("dt", "dtfm")]
-        if values[0] != values[1]:
-            raise UsageError(f"{key} of {task} is {values[0]!r} for dt and {values[1]!r} for dtfm; both need the same.")
+    common = [set.intersection(*map(of, ALGORITHMS)) for of in (_constructor_parameters, _policy_parameters)]
+    for key in sorted(set.union(*common) - {"policy_kwargs"}):
+        values = {algo: each.get(key) for algo, each in flat.items()}
+        if any(value != next(iter(values.values())) for value in values.values()):
+            found = " and ".join(f"{value!r} for {algo}" for algo, value in values.items())
+            raise UsageError(f"{key} of {task} is {found}; all need the same.")
 
 
 def _policy_kwargs(settings: dict[str, Any]) -> dict[str, Any]:
@@ -153,24 +158,23 @@ def _policy_kwargs(settings: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _known(settings: dict[str, Any], algo: str, parameters: Any) -> dict[str, Any]:
-    """The settings without those that another algorithm knows and this one does not."""
-    others = set().union(*(_only_of(other, parameters) for other in OFFLINE_ALGORITHMS if other != algo))
-    return {key: value for key, value in settings.items() if key not in others}
+def _known(settings: dict[str, Any], algo: str, parameters: Callable[[str], set[str]]) -> dict[str, Any]:
+    """
+    The settings without those that only other algorithms know.
+
+    :raises UsageError: nobody knows one of them
+    """
+    unknown = set(settings).difference(*map(parameters, ALGORITHMS))
+    if unknown:
+        raise UsageError(f"{', '.join(sorted(map(str, unknown)))}: no setting of {algo} (--profile, -params).")
+    return {key: value for key, value in settings.items() if key in parameters(algo)}
 
 
-def _only_of(algo: str, parameters: Any) -> set[str]:
-    """Names that one algorithm knows and none of the others."""
-    return parameters(algo) - set().union(*(parameters(other) for other in OFFLINE_ALGORITHMS if other != algo))
+def _constructor_parameters(algo: str) -> set[str]:
+    """What may stand in a YAML file: arguments of the algorithm, and RL-Zoo's own."""
+    return ZOO_KEYS | set(inspect.signature(ALGORITHMS[algo]).parameters)
 
 
-@cache
-def _constructor_parameters(algo: str) -> frozenset[str]:
-    return frozenset(inspect.signature(OFFLINE_ALGORITHMS[algo]).parameters)
-
-
-@cache
-def _policy_parameters(algo: str) -> frozenset[str]:
-    """Arguments of the policy class; DTFM's own ones stand beside `**kwargs`."""
-    policy = POLICIES[algo]
-    return frozenset(name for kind in policy.__mro__ for name in inspect.signature(kind).parameters)
+def _policy_parameters(algo: str) -> set[str]:
+    """What may stand in its `policy_kwargs`."""
+    return policy_of(algo).parameter_names()

@@ -14,7 +14,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_dtfm import DTFM
-from sb3_dtfm.benchmark.statistics import wilson
+from sb3_dtfm.benchmark.report.statistics import wilson
 from sb3_dtfm.cli import train
 from sb3_dtfm.cli.plot import plot_learning_curve
 from sb3_dtfm.recording.demonstrations import record_demonstrations

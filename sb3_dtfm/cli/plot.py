@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sb3_dtfm.benchmark.statistics import wilson
+from sb3_dtfm.benchmark.report.statistics import wilson
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

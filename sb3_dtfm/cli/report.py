@@ -1,5 +1,65 @@
-"""`sb3-dtfm report`."""
+"""`sb3-dtfm report`: tables and figures from rows of results."""
 
-from sb3_dtfm.benchmark.report import main
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
 
-__all__ = ["main"]
+from sb3_dtfm.benchmark.report.changes import split_changes
+from sb3_dtfm.benchmark.report.figures import check_baselines, plot_group, plot_solved, read_baseline
+from sb3_dtfm.benchmark.report.runs import Group, Study, read_studies
+from sb3_dtfm.benchmark.report.tables import make_report
+from sb3_dtfm.benchmark.rows import plain_name
+
+
+def main(argv: Sequence[str]) -> None:
+    """
+    Run `sb3-dtfm report`.
+
+    :param argv: its arguments
+    :raises ValueError: a malformed argument or row, or no finished cell
+    :raises FileNotFoundError: no such folder or file
+    """
+    parser = argparse.ArgumentParser(
+        prog="sb3-dtfm report",
+        description="Write report.md and figures from rows of `sb3-dtfm benchmark`.",
+        epilog="Folders below those named are studies: each has its own part of the report. Rows of folders and files that "
+        "are named themselves are put together. Settings that a label changed are compared with runs without it, of the "
+        "same study if it has some.",
+    )
+    parser.add_argument("results", nargs="+", help="folders or files of rows")
+    argument = parser.add_argument
+    argument("-o", "--output", default="docs", metavar="DIR", help="where report.md and the PNGs go; docs by default")
+    argument(
+        "--env", "--tasks", dest="tasks", nargs="+", default=[], metavar="TASK", help="show these first, even if not run"
+    )
+    several = dict(action="append", default=[], metavar="[TASK:]NAME=FILE")
+    argument("--baseline", **several, help="curve of an SB3 run: its evaluations.npz")
+    argument("--no-agent-line", action="store_true", help="do not draw the return of the recorded episodes")
+    options = parser.parse_args(argv)
+    studies = read_studies(options.results, options.tasks)
+    if not any(study.groups for study in studies):
+        raise ValueError(f"{', '.join(options.results)}: no finished cell; `sb3-dtfm benchmark` writes some.")
+    baselines = [read_baseline(text) for text in options.baseline]
+    check_baselines(
+        baselines, list(dict.fromkeys(task for study in studies for group in study.groups for task in group.tasks))
+    )
+    output = Path(options.output)
+    figures = {}
+    for study in studies:
+        for group in split_changes(study, studies)[0]:
+            drawn = [
+                plot_group(group, output / figure_name("curves", study, group), baselines, not options.no_agent_line),
+                plot_solved(group, output / figure_name("solved", study, group)),
+            ]
+            figures[study.name, group.title] = [file.name for file in drawn if file is not None]
+            print(*(file for file in drawn if file is not None), sep="\n")
+    report = output / "report.md"
+    report.write_text(make_report(studies, figures))
+    print(report)
+
+
+def figure_name(kind: str, study: Study, group: Group) -> str:
+    """File name of a group's figure: of its learning "curves", or of what was "solved" by environment step."""
+    return (
+        plain_name("-".join(part for part in dict.fromkeys((kind, group.profile, group.label, study.name)) if part)) + ".png"
+    )

@@ -2,19 +2,28 @@
 
 from pathlib import Path
 
+import pytest
+
 from sb3_dtfm.cli.main import main
 
 ROOT = Path(__file__).parents[2]
+# Where a report lies, and of what it is; results/README.md has the commands.
+STUDIES = ("time-steps", "windows/*_uniform-windows.jsonl", "paused", "mixed", "few", "noisy", "two-ways")
+REPORTS = {"docs": ("small",), "docs/studies": STUDIES}
 
 
 def tables(text: str) -> list[str]:
     return [block for block in text.split("\n\n") if block.startswith("| ")]
 
 
-def test_the_report_and_the_readme_show_the_committed_rows(tmp_path):
-    assert main(["report", str(ROOT / "results" / "small"), "-o", str(tmp_path)]) == 0
-    text = (tmp_path / "report.md").read_text()
-    assert (ROOT / "docs" / "report.md").read_text() == text
-    assert tables(text)[0] in tables((ROOT / "README.md").read_text())
+@pytest.mark.parametrize("docs", REPORTS)
+def test_a_report_shows_the_committed_rows(docs, tmp_path):
+    results = [str(path) for pattern in REPORTS[docs] for path in sorted((ROOT / "results").glob(pattern))]
+    assert main(["report", *results, "-o", str(tmp_path)]) == 0
+    assert (ROOT / docs / "report.md").read_text() == (tmp_path / "report.md").read_text()
     for figure in tmp_path.glob("*.png"):
-        assert (ROOT / "docs" / figure.name).is_file()
+        assert (ROOT / docs / figure.name).is_file()
+
+
+def test_the_readme_shows_the_table_of_the_report():
+    assert tables((ROOT / "docs" / "report.md").read_text())[0] in tables((ROOT / "README.md").read_text())

@@ -1,14 +1,28 @@
 """Evaluation counts each initial state once, whatever the number of environments and the lengths of episodes."""
 
-from types import SimpleNamespace
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
+import yaml
 from gymnasium import spaces
+from rl_zoo3.utils import get_callback_list
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_dtfm.benchmark.evaluation import EvaluationCallback, SeededEpisodes, evaluate
+from sb3_dtfm import DTFM
+from sb3_dtfm.benchmark.evaluation import (
+    FINAL_STATES,
+    TRAINING_STATES,
+    EvaluationCallback,
+    SeededEpisodes,
+    evaluate,
+    make_seeded_envs,
+)
+from sb3_dtfm.benchmark.rows import Cell, read_rows
+from sb3_dtfm.benchmark.runner import CALLBACK
+from tests.conftest import TINY_FLOW_POLICY
 
 
 class Countdown(gym.Env):
@@ -75,27 +89,64 @@ def test_success_goes_by_the_name_that_gymnasium_robotics_has_for_it_too():
     assert evaluate(Idle(), vec_env(2, success_key="success"), [3, 4]).successes == [False, True]
 
 
-def test_evaluations_come_at_a_fixed_interval_and_at_the_end_on_other_states(monkeypatch):
-    rows, progress = [], []
-    callback = EvaluationCallback(vec_env(2), 3, 2, 4, rows.append, lambda *told: progress.append(told))
-    model = Idle()
-    model.policy = SimpleNamespace(solver="heun", n_solver_steps=5)
-    model._total_timesteps = 7
-    callback.model = model
-    seen = []
+@pytest.fixture
+def row() -> dict[str, Any]:
+    """What all rows of a run say: HalfCheetah in episodes of 5 steps."""
+    wrapper = {"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 5.0}}
+    settings = {"env_wrapper": [wrapper], "env_kwargs": {"max_episode_steps": 5}}
+    return {**Cell("HalfCheetah-v5", 1.0, "dtfm", 3, "tiny")._asdict(), "settings": settings, "data": {}}
 
-    def short_episodes(model, env, seeds, after_step):
-        seen.append(list(seeds))
-        return evaluate(model, env, [1] * len(seeds))
 
-    monkeypatch.setattr("sb3_dtfm.benchmark.evaluation.evaluate", short_episodes)
-    callback._on_training_start()
-    for callback.num_timesteps in range(1, 8):
-        assert callback._on_step()
-    assert [(row["step"], row["final"], len(row["returns"])) for row in rows] == [(3, False, 2), (6, False, 2), (7, True, 4)]
-    assert seen[0] == seen[1]
-    assert not set(seen[0]) & set(seen[2])
-    assert {(row["solver"], row["n_solver_steps"]) for row in rows} == {("heun", 5)}
-    walls = [row["wall_s"] for row in rows]
+def make_model(buffer, learning_rate: float = 1e-3) -> DTFM:
+    policy_kwargs = dict(TINY_FLOW_POLICY, solver="heun")
+    settings = dict(batch_size=4, context_length=3, seed=3, device="cpu", policy_kwargs=policy_kwargs)
+    return DTFM("MultiInputPolicy", dataset=buffer, learning_rate=learning_rate, **settings)
+
+
+def test_rows_come_before_during_and_after_training_and_at_the_end_on_other_states_too(
+    tmp_path, row, cheetah_buffer, capsys
+):
+    file = tmp_path / "rows.jsonl"
+    model = make_model(cheetah_buffer)
+    model.learn(7, EvaluationCallback(str(file), row, eval_freq=3, n_episodes=2, n_final_episodes=4, n_envs=2))
+    rows = read_rows(file)
+    steps = [(0, False, 2), (3, False, 2), (6, False, 2), (7, False, 2), (7, True, 4)]
+    assert [(each["step"], each["final"], len(each["returns"])) for each in rows] == steps
+    assert {each: rows[0][each] for each in row} == row
+    assert {(each["solver"], each["n_solver_steps"]) for each in rows} == {("heun", 4)}
+    assert all(each["lengths"] == [5] * len(each["returns"]) and each["successes"] is None for each in rows)
+    assert (rows[0]["steps_per_s"], rows[-1]["hardware"]["gpu"]) == (0.0, None)
+    walls = [each["wall_s"] for each in rows]
     assert walls == sorted(walls)
-    assert progress[0] == (1, 7, "training")
+    # The last two rows are of the same weights, on the states that their seeds give
+    envs = make_seeded_envs(row["task"], row["settings"], 1)
+    for each, first in ((rows[3], TRAINING_STATES), (rows[4], FINAL_STATES)):
+        assert evaluate(model, envs, range(first, first + len(each["returns"]))).returns == each["returns"]
+    assert not set(rows[3]["returns"]) & set(rows[4]["returns"])
+    assert capsys.readouterr().out.startswith("step 0 of 7: evaluation 0/2\n")
+
+
+def test_the_first_evaluation_is_of_the_untrained_weights(tmp_path, row, cheetah_buffer):
+    untrained = make_model(cheetah_buffer)
+    envs = make_seeded_envs(row["task"], row["settings"], 1)
+    expected = evaluate(untrained, envs, [TRAINING_STATES])
+    callback = EvaluationCallback(str(tmp_path / "rows.jsonl"), row, eval_freq=1, n_episodes=1, n_final_episodes=1)
+    make_model(cheetah_buffer, learning_rate=0.1).learn(1, callback)
+    rows = read_rows(tmp_path / "rows.jsonl")
+    assert rows[0]["returns"] == expected.returns
+    assert rows[1]["returns"] != expected.returns
+
+
+def test_evaluating_changes_no_training(tmp_path, row, cheetah_buffer):
+    callback = EvaluationCallback(str(tmp_path / "rows.jsonl"), row, eval_freq=2, n_episodes=2, n_final_episodes=2)
+    models = make_model(cheetah_buffer).learn(5, callback), make_model(cheetah_buffer).learn(5)
+    for evaluated, alone in zip(*(model.policy.parameters() for model in models), strict=True):
+        assert th.equal(evaluated, alone)
+
+
+def test_rl_zoo_makes_the_callback_from_plain_data(tmp_path, row):
+    arguments = dict(rows=str(tmp_path / "rows.jsonl"), row=row, eval_freq=2, n_episodes=2, n_final_episodes=3)
+    text = yaml.safe_dump({"callback": [{CALLBACK: arguments}]})
+    (callback,) = get_callback_list(yaml.safe_load(text))
+    assert isinstance(callback, EvaluationCallback)
+    assert callback.row["settings"] == row["settings"]

@@ -6,17 +6,20 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from threading import Thread
 
 import pytest
 import yaml
 from filelock import FileLock
 
+from sb3_dtfm import DTFM
 from sb3_dtfm.benchmark import runner
-from sb3_dtfm.benchmark.display import PlainDisplay
-from sb3_dtfm.benchmark.grid import parse_arguments, plan, read_tasks
+from sb3_dtfm.benchmark.grid import plan, read_tasks
 from sb3_dtfm.benchmark.rows import read_rows
 from sb3_dtfm.benchmark.settings import Task, task_settings
+from sb3_dtfm.cli.benchmark import parse_arguments
 from sb3_dtfm.cli.main import main
 from sb3_dtfm.zoo.arguments import UsageError
 from tests.zoo.conftest import DATASET_ID
@@ -24,7 +27,7 @@ from tests.zoo.conftest import DATASET_ID
 TASK = "HalfCheetah-v5"
 POLICY = dict(embed_dim=16, n_layers=1, n_heads=1, flow_hidden_dim=16, flow_n_layers=1, n_solver_steps=2)
 SETTINGS = dict(policy="MultiInputPolicy", n_timesteps=6, batch_size=4, context_length=3, policy_kwargs=POLICY)
-STEPS = [(2, False), (4, False), (6, False), (6, True)]
+STEPS = [(0, False), (2, False), (4, False), (6, False), (6, True)]
 PATIENCE = 120  # seconds to wait for a cell
 
 
@@ -42,62 +45,88 @@ def start(arguments: list[str]) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-m", "sb3_dtfm", *arguments], env=environment, stdout=subprocess.DEVNULL)
 
 
-def test_a_killed_grid_goes_on_and_repeats_nothing(grid, workplace, capfd, monkeypatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    process = start(grid)
-    results = workplace / "results"
+def cells_of(grid: int) -> list[int]:
+    """Processes that a grid's threads have started."""
+    return [int(pid) for file in Path(f"/proc/{grid}/task").glob("*/children") for pid in file.read_text().split()]
+
+
+def is_running(pid: int) -> bool:
+    """Neither gone nor a zombie."""
+    stat = Path(f"/proc/{pid}/stat")
+    return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
     deadline = time.monotonic() + PATIENCE
-    while not list(results.glob("*.jsonl")) and process.poll() is None and time.monotonic() < deadline:
+    while not condition():
+        assert time.monotonic() < deadline
         time.sleep(0.05)
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
+def test_a_killed_grid_takes_its_cell_along_goes_on_and_repeats_nothing(grid, workplace, capfd, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    grid += ["--fractions", "0.5"]
+    process = start(grid)
+    results, logs = workplace / "results", workplace / "logs" / "benchmark" / f"{TASK}_0.5_dtfm_seed0_tiny"
+    wait_until(
+        lambda: process.poll() is not None or (any(results.glob("*.jsonl")) and logs.exists() and cells_of(process.pid))
+    )
+    (orphan,) = cells_of(process.pid)
     process.send_signal(signal.SIGKILL)
     process.wait()
+    wait_until(lambda: not is_running(orphan))
+    assert not list(logs.glob("*/rows.jsonl"))
     (first,) = results.glob("*.jsonl")
     content, written = first.read_bytes(), first.stat().st_mtime_ns
     # What a cell that was killed halfway leaves behind
-    broken = workplace / "logs" / "benchmark" / f"{TASK}_0.5_dtfm_seed0_tiny" / "attempt-old"
-    broken.mkdir(parents=True)
+    broken = logs / "attempt-old"
+    broken.mkdir()
     (broken / "rows.jsonl").write_text(content.decode().splitlines()[0] + "\n")
 
     assert main(grid) == 0
     output = capfd.readouterr().out
-    assert "3 cells to run, 1 finished already in results" in output
-    assert "[3/3]" in output
+    assert "1 cells to run, 1 finished already in results" in output
+    assert "[1/1]" in output
     assert (first.read_bytes(), first.stat().st_mtime_ns) == (content, written)
     assert not broken.exists()
-    rows = {path.name: read_rows(path) for path in results.glob("*.jsonl")}
-    assert {(row["algo"], row["regime"]) for each in rows.values() for row in each} == {
-        ("dt", 1.0), ("dt", 0.5), ("dtfm", 1.0), ("dtfm", 0.5),
-    }  # fmt: skip
+    rows = {each[0]["algo"]: each for each in map(read_rows, results.glob("*.jsonl"))}
+    assert set(rows) == {"dt", "dtfm"}
     for each in rows.values():
         assert [(row["step"], row["final"]) for row in each] == STEPS
-        assert [len(row["returns"]) for row in each] == [2, 2, 2, 3]
+        assert [len(row["returns"]) for row in each] == [2, 2, 2, 2, 3]
         assert {length for row in each for length in row["lengths"]} == {10}
         assert all(row["successes"] is None for row in each)
         assert {row["data"]["dataset"] for row in each} == {DATASET_ID}
         assert {row["data"]["n_episodes"] for row in each} == {3}
         assert each[0]["data"]["recorded_from"].startswith("PPO: ")
-        assert (each[0]["solver"], each[0]["n_solver_steps"]) == (
-            ("euler", 2) if each[0]["algo"] == "dtfm" else (None, None)
-        )
+        assert each[0]["settings"]["env_kwargs"] == {"max_episode_steps": 10}
+        assert (each[0]["regime"], each[0]["hardware"]["threads"]) == (0.5, 1)
+    assert [(each[0]["solver"], each[0]["n_solver_steps"]) for each in (rows["dt"], rows["dtfm"])] == [
+        (None, None),
+        ("euler", 2),
+    ]
+    (model,) = logs.glob("attempt-*/logs/dtfm/*/HalfCheetah-v5.zip")
+    assert DTFM.load(model).num_timesteps == 6
 
     assert main(grid) == 0
-    assert "0 cells to run, 4 finished already" in capfd.readouterr().out
+    assert "0 cells to run, 2 finished already" in capfd.readouterr().out
     assert main(["report", "results", "-o", "docs"]) == 0
-    assert "not run" not in (workplace / "docs" / "report.md").read_text().split("Aggregates")[0]
+    assert f"| {TASK} | 50% | *not run*" not in (workplace / "docs" / "report.md").read_text()
     assert main([*grid, "-n", "8"]) == 2
     assert "results has it with 6 gradient steps, 8 are asked for" in capfd.readouterr().err
 
 
 STUB = """
-import json, pathlib, sys, time
-spec = pathlib.Path(sys.argv[1])
-row = json.loads(spec.read_text())["row"]
-(spec.parent / "progress.json").write_text(json.dumps([3, 6, "training"]))
-if row["algo"] == "dtfm":
+import json, pathlib, sys, time, yaml
+(settings,) = yaml.safe_load(pathlib.Path(sys.argv[sys.argv.index("--conf-file") + 1]).read_text()).values()
+(arguments,) = settings["callback"][-1].values()
+print("step 3 of 6: training", flush=True)
+if arguments["row"]["algo"] == "dtfm":
     {instead}
 evaluation = dict(step=6, final=True, returns=[1.0], lengths=[2], successes=None, solver=None, n_solver_steps=None)
 rest = dict(wall_s=1.0, steps_per_s=6.0, commit=None, versions={{}}, hardware={{}})
-(spec.parent / "rows.jsonl").write_text(json.dumps({{**row, **evaluation, **rest}}) + chr(10))
+pathlib.Path(arguments["rows"]).write_text(json.dumps({{**arguments["row"], **evaluation, **rest}}) + chr(10))
 """
 
 
@@ -108,7 +137,7 @@ def stub(workplace, monkeypatch):
     def use(instead: str) -> None:
         (workplace / "stub.py").write_text(STUB.format(instead=instead))
 
-    monkeypatch.setattr(runner, "CELL_MODULE", "stub")
+    monkeypatch.setattr(runner, "TRAIN", [sys.executable, "stub.py"])
     return use
 
 
@@ -134,22 +163,24 @@ def test_a_cell_that_fails_leaves_a_log_and_the_grid_goes_on(instead, says, grid
 
 
 def test_an_interrupted_grid_ends_its_cells_and_says_so(grid, stub, workplace, monkeypatch, capfd):
-    stub("time.sleep(600)")
+    stub("pathlib.Path('asleep').touch(); time.sleep(600)")
     started = []
     popen = subprocess.Popen
     monkeypatch.setattr(
         runner.subprocess, "Popen", lambda *args, **kwargs: started.append(popen(*args, **kwargs)) or started[-1]
     )
 
-    def interrupt(*_) -> None:
-        if list(workplace.glob("logs/benchmark/*dtfm*/*/progress.json")):
-            os.kill(os.getpid(), signal.SIGTERM)
+    def interrupt() -> None:
+        wait_until((workplace / "asleep").exists)
+        os.kill(os.getpid(), signal.SIGTERM)
 
-    monkeypatch.setattr(PlainDisplay, "update", interrupt)
+    Thread(target=interrupt).start()
     with pytest.raises(SystemExit) as exit_:
         main([*grid, "--fractions", "1"])
     assert exit_.value.code == 130
-    assert "Interrupted after 1 of 2 cells" in capfd.readouterr().out
+    output = capfd.readouterr().out
+    assert "Interrupted after 1 of 2 cells" in output
+    assert "FAILED" not in output
     assert [process.returncode for process in started] == [0, -signal.SIGTERM]
     assert len(list((workplace / "results").glob("*.jsonl"))) == 1
 
@@ -181,14 +212,13 @@ def test_the_packaged_profiles_differ_in_the_head_only(profile, env_id):
 
 
 def test_policy_kwargs_of_params_are_merged_and_heads_left_to_their_algorithm():
-    changes = {"policy_kwargs": {"n_solver_steps": 3, "dropout": 0.0}, "regression_coef": 0.1, "ema_decay": 0.9}
+    kwargs = {"n_solver_steps": 3, "dropout": 0.0, "regression_coef": 0.1}
+    changes = {"policy_kwargs": kwargs, "ema_decay": 0.9}
     dt, dtfm = (task_settings("small", algo, Task(TASK), 1.0, 7, changes) for algo in ("dt", "dtfm"))
-    assert dtfm["policy_kwargs"]["n_solver_steps"] == 3
+    assert (dtfm["policy_kwargs"]["n_solver_steps"], dtfm["policy_kwargs"]["regression_coef"]) == (3, 0.1)
     assert dtfm["policy_kwargs"]["embed_dim"] == 128
-    assert dtfm["regression_coef"] == 0.1
     assert (dt["policy_kwargs"]["dropout"], dt["ema_decay"], dt["n_timesteps"]) == (0.0, 0.9, 7)
-    assert "regression_coef" not in dt
-    assert "n_solver_steps" not in dt["policy_kwargs"]
+    assert not {"n_solver_steps", "regression_coef"} & set(dt["policy_kwargs"])
 
 
 def test_tasks_come_from_a_file_or_from_pairs(tmp_path):

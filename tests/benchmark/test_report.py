@@ -6,8 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_dtfm.benchmark.rows import Cell, merge_rows, result_files
-from sb3_dtfm.benchmark.runs import group_runs, learning_curve, paired_scores, spread, steps_to_success
+from sb3_dtfm.benchmark.report.figures import plot_group
+from sb3_dtfm.benchmark.report.runs import (
+    OVER_EPISODES,
+    OVER_SEEDS,
+    group_runs,
+    learning_curve,
+    paired_scores,
+    read_studies,
+    spread,
+    steps_to_success,
+)
+from sb3_dtfm.benchmark.rows import Cell
 from sb3_dtfm.cli.main import main
 
 ROWS = Path(__file__).parent / "rows"
@@ -16,8 +26,8 @@ LIFT, CHEETAH = "robosuite/Lift-v0", "HalfCheetah-v5"
 
 @pytest.fixture(scope="module")
 def groups():
-    found, _ = group_runs(merge_rows(result_files([ROWS])), [LIFT])
-    return {group.title: group for group in found}
+    (study,) = read_studies([ROWS], [LIFT])
+    return {group.title: group for group in study.groups}
 
 
 def table_row(text: str, *start: str) -> list[list[str]]:
@@ -27,9 +37,9 @@ def table_row(text: str, *start: str) -> list[list[str]]:
 
 
 def test_labels_are_told_apart_and_unfinished_cells_left_out():
-    groups, unfinished = group_runs(merge_rows(result_files([ROWS])))
-    assert [group.title for group in groups] == ["small", "small, ema"]
-    assert unfinished == [Cell(CHEETAH, 1.0, "dt", 0, "small")]
+    (study,) = read_studies([ROWS])
+    assert [group.title for group in study.groups] == ["small", "small, ema"]
+    assert study.unfinished == [Cell(CHEETAH, 1.0, "dt", 0, "small")]
 
 
 def test_late_best_and_final_are_those_of_each_run(groups):
@@ -42,6 +52,19 @@ def test_late_best_and_final_are_those_of_each_run(groups):
     assert groups["small, ema"].of(CHEETAH, 0.5, "dtfm")[0].value("late") is None
 
 
+def test_an_evaluation_before_training_is_drawn_and_counts_for_no_measure(groups):
+    run = groups["small"].of(LIFT, 1.0, "dt")[0]
+    untrained = {**run.evaluations[-1], "step": 0, "successes": [True] * 4, "returns": [1.0] * 4}
+    for rows in (run.evaluations, run.evaluations[-2:], []):
+        before = run._replace(evaluations=rows)
+        (group,), _ = group_runs([untrained, *rows, run.final])
+        (found,) = group.of(LIFT, 1.0, "dt")
+        assert found.evaluations == [untrained, *rows]
+        for measure in ("late", "best", "final"):
+            assert found.value(measure) == before.value(measure)
+        assert learning_curve([found]).mean.tolist() == [100.0, *learning_curve([before]).mean.tolist()]
+
+
 def test_the_curve_is_the_mean_over_seeds_with_a_pooled_band(groups):
     curve = learning_curve(groups["small"].of(LIFT, 1.0, "dt"))
     assert curve.steps.tolist() == [10, 20, 30, 40, 50, 60]
@@ -52,6 +75,50 @@ def test_the_curve_is_the_mean_over_seeds_with_a_pooled_band(groups):
     assert (curve.low[2], curve.high[2]) == pytest.approx((21.52, 78.48), abs=0.01)
 
 
+def with_returns(run, *returns: list[float]):
+    """The run with these returns at its evaluations, of a task without success."""
+    rows = [{**row, "returns": values, "successes": None} for row, values in zip(run.evaluations, returns, strict=False)]
+    return run._replace(evaluations=rows, final={**run.final, "successes": None})
+
+
+def test_the_band_of_returns_is_over_the_episodes_of_one_seed_and_the_range_of_several(groups):
+    run = groups["small"].of(LIFT, 1.0, "dt")[0]
+    first, second = with_returns(run, [1.0, 2.0, 3.0], [5.0, 7.0]), with_returns(run, [4.0, 4.0], [1.0, 2.0])
+    alone = learning_curve([first])
+    assert (alone.mean.tolist(), alone.band) == ([2.0, 6.0], OVER_EPISODES)
+    assert alone.high[0] == pytest.approx(2.0 + 4.302653 / math.sqrt(3))
+    both = learning_curve([first, second])
+    assert (both.mean.tolist(), both.low.tolist(), both.high.tolist()) == ([3.0, 3.75], [2.0, 1.5], [4.0, 6.0])
+    assert both.band == OVER_SEEDS
+
+
+def test_all_that_is_drawn_lies_inside_the_axes_and_the_legend_names_the_bands(groups, tmp_path, monkeypatch):
+    from matplotlib.figure import Figure
+
+    figures = []
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *args, **kwargs: figures.append(self) or save(self, *args, **kwargs))
+    group = groups["small"]
+    runs = {key: [with_returns(run, *([i, 3.0, 900.0] for i in range(6))) for run in of] for key, of in group.runs.items()}
+    for each in (group, group._replace(runs=runs)):
+        plot_group(each, tmp_path / "curves.png")
+        (figure,) = figures
+        figures.clear()
+        for axis in figure.axes:
+            for band in axis.collections:
+                for path in band.get_paths():
+                    for (left, right), values in zip((axis.get_xlim(), axis.get_ylim()), path.vertices.T, strict=True):
+                        assert left <= values.min()
+                        assert values.max() <= right
+        (legend,) = figure.legends
+        named = {text.get_text() for text in legend.get_texts()}
+        assert {"DT", "DTFM", OVER_EPISODES} <= named
+        assert (OVER_SEEDS in named) == (each is not group)
+        figure.canvas.draw()
+        assert figure.bbox.x0 <= legend.get_window_extent().x0
+        assert legend.get_window_extent().x1 <= figure.bbox.x1
+
+
 def test_steps_to_success_are_those_of_all_seeds_and_failures_take_for_ever(groups):
     run = groups["small"].of(LIFT, 1.0, "dt")[0]
     other = run._replace(final={**run.final, "lengths": [30, 50], "successes": [True, True]})
@@ -59,7 +126,7 @@ def test_steps_to_success_are_those_of_all_seeds_and_failures_take_for_ever(grou
 
 
 def test_scores_are_shares_of_the_recorded_return(groups):
-    keys, dt, dtfm = paired_scores(groups["small"], "final")
+    keys, dt, dtfm = paired_scores(groups["small"], "dt", "dtfm", "final")
     assert keys == [(LIFT, 1.0), (CHEETAH, 0.5)]
     assert [scores.tolist() for scores in dt] == [[0.75, 0.75], [0.5]]
     assert [scores.tolist() for scores in dtfm] == [[1.0, 1.0, 1.0], [0.8]]
@@ -75,16 +142,18 @@ def test_the_report_shows_what_was_run_and_what_was_not(tmp_path, capsys):
     assert interval[:2] == ["55.0 [0.0, 100.0]", "88.3 [62.5, 100.0]"]
     assert interval[2:] == ["75.0 [40.9, 92.9] % of 8 episodes", "100.0 [75.8, 100.0] % of 12 episodes"]
     assert steps == ["40", "40"]
-    assert pace == ["2.0", "12.5", "37.5", "2.0", "12.5", "50.0"]
+    assert pace == ["2.0", "2.0", "12.5", "12.5", "37.5", "50.0"]
     assert table_row(text, LIFT, "50%")[0] == ["*not run*"] * 6 + ["0 / 0"]
     assert len(table_row(text, "Ant-v5", "100%")) == 4
     achieved, interval, scores = table_row(text, CHEETAH, "50%")[:3]
     assert achieved[:2] == ["3,800", "6,050"]
     assert interval[0] == "3,800 (one seed, no interval)"
     assert interval[2:] == ["5,000 (one seed, no interval)", "8,000 (one seed, no interval)"]
-    assert scores == ["10,000 (TQC: sampled actions)", "0.38", "0.60", "0.50", "0.80"]
-    # DTFM wins all 6 pairs on Lift, and the one on HalfCheetah
-    assert table_row(text, "final evaluation")[0][2] == "1.00 [1.00, 1.00]"
+    assert scores == ["0.38", "0.60", "0.50", "0.80", "10,000 (TQC: sampled actions)"]
+    # DTFM wins all 6 pairs on Lift, and the one on HalfCheetah, which has one run of each
+    single = "(no interval: 1 cell has a single run)"
+    assert table_row(text, "final evaluation")[0] == [f"0.67 {single}", f"1.00 {single}", f"1.00 {single}"]
+    assert "2 cells (task and share of the data) of 2 tasks, 7 runs" in text
     assert "Left out, as they have no final evaluation: HalfCheetah-v5, 100% of the data, dt, seed 0, small." in text
     assert "`local/halfcheetah/expert-v0`, 100 episodes, recorded from TQC: sampled actions" in text
     assert "](curves-small.png)" in text
@@ -99,8 +168,50 @@ def test_a_label_stands_beside_the_same_cell_without_it(tmp_path):
         "`ema_decay: 0.99` (not 0.999), `kv_cache: True`, `target_return: 9000.0` (not 12000.0), no `warmup_steps` (not 5)"
     )
     (row,) = table_row((tmp_path / "report.md").read_text(), "ema")
-    assert row == [settings, CHEETAH, "50%", "DTFM", "-", "6,050", "9,000", "8,000", "1", "2.0"]
+    assert row == [settings, CHEETAH, "50%", "DTFM", "-", "6,050", "9,000", "8,000", "1", "2.0", "0123456", "0123456"]
     assert not (tmp_path / "curves-small-ema.png").exists()
+
+
+def test_a_label_of_another_commit_says_so_in_its_table(tmp_path):
+    rows = [line for line in (ROWS / "halfcheetah.jsonl").read_text().splitlines() if '"label": "ema"' in line]
+    again = [row.replace("0123456789abcdef", "fedcba9876543210-dirty").replace('"seed": 0', '"seed": 1') for row in rows]
+    (tmp_path / "again.jsonl").write_text("\n".join(again) + "\n")
+    assert main(["report", str(ROWS), str(tmp_path / "again.jsonl"), "-o", str(tmp_path)]) == 0
+    (row,) = table_row((tmp_path / "report.md").read_text(), "ema")
+    assert row[-2:] == ["0123456, fedcba9-dirty", "0123456"]
+
+
+def test_a_folder_for_each_study_makes_a_part_for_each(tmp_path):
+    lines = (ROWS / "halfcheetah.jsonl").read_text().splitlines()
+    for study, labelled in (("ema", True), ("main", False)):
+        (tmp_path / study).mkdir()
+        (tmp_path / study / "rows.jsonl").write_text(
+            "\n".join(row for row in lines if ('"label": "ema"' in row) == labelled)
+        )
+    assert main(["report", str(tmp_path), "-o", str(tmp_path / "docs")]) == 0
+    text = (tmp_path / "docs" / "report.md").read_text()
+    headings = [line for line in text.splitlines() if line.startswith("##")]
+    assert headings == ["## Study: main", "### Settings: small", "## Study: ema", "### Changes to: small"]
+    assert "](curves-small-main.png)" in text
+    (row,) = table_row(text, "ema")
+    assert row[4:8] == ["-", "6,050", "9,000", "8,000"], "beside the runs of another study"
+    # Two folders that are named are put together
+    assert main(["report", str(tmp_path / "ema"), str(tmp_path / "main"), "-o", str(tmp_path / "docs")]) == 0
+    text = (tmp_path / "docs" / "report.md").read_text()
+    assert [line for line in text.splitlines() if line.startswith("##")] == ["## Settings: small", "## Changes to: small"]
+
+
+def test_a_third_algorithm_has_its_columns_and_its_comparison(tmp_path):
+    rows = (ROWS / "lift.jsonl").read_text()
+    third = "\n".join(
+        row.replace('"algo": "dtfm"', '"algo": "mean"') for row in rows.splitlines() if '"algo": "dtfm"' in row
+    )
+    (tmp_path / "rows.jsonl").write_text(f"{rows}{third}\n")
+    assert main(["report", str(tmp_path / "rows.jsonl"), "-o", str(tmp_path)]) == 0
+    text = (tmp_path / "report.md").read_text()
+    assert table_row(text, LIFT, "100%")[0][-1] == "2 / 3 / 3"
+    assert "P(DTFM > DT)" in text
+    assert "P(MEAN > DT)" in text
 
 
 def test_a_label_alone_is_a_group_of_its_own(tmp_path):

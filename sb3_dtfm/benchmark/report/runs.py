@@ -1,17 +1,20 @@
 """From rows to runs: what each training run achieved, and how runs of a cell are summed up."""
 
+import os
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from sb3_dtfm.benchmark.rows import Cell, Row
-from sb3_dtfm.benchmark.statistics import Interval, mean_and_deviation, student_t, wilson
+from sb3_dtfm.benchmark.report.statistics import Interval, mean_and_deviation, student_t, wilson
+from sb3_dtfm.benchmark.rows import Cell, Row, merge_rows, result_files
 
-ALGORITHMS = {"dt": "DT", "dtfm": "DTFM"}
+# The paper's comparison, which is shown whether it was run or not.
+PAPER_ALGORITHMS = ("dt", "dtfm")
 PAPER_REGIMES = (1.0, 0.5)
 N_LATE = 5  # evaluations in the late average
 MEASURES = {"late": "late average", "best": "best evaluation", "final": "final evaluation"}
+OVER_EPISODES, OVER_SEEDS = "95 % interval over episodes", "range over seeds"
 
 
 class Run(NamedTuple):
@@ -19,7 +22,7 @@ class Run(NamedTuple):
     One training run.
 
     :param cell: what it is known by
-    :param evaluations: rows of the evaluations during training, by gradient step
+    :param evaluations: rows of the evaluations before and during training, by gradient step
     :param final: row of the final evaluation
     """
 
@@ -36,12 +39,12 @@ class Run(NamedTuple):
         """
         Success in percent, or mean return in reward units.
 
-        :param measure: "late", "best" or "final"
+        :param measure: "late", "best" or "final"; an evaluation before the first gradient step counts for none
         :return: None where there was no evaluation during training
         """
         if measure == "final":
             return row_value(self.final)
-        values = [row_value(row) for row in self.evaluations]
+        values = [row_value(row) for row in self.evaluations if row["step"] > 0]
         if not values:
             return None
         return max(values) if measure == "best" else float(np.mean(values[-N_LATE:]))
@@ -62,19 +65,26 @@ class Run(NamedTuple):
         """Training time without evaluations."""
         return self.final["wall_s"] / 60
 
+    @property
+    def commit(self) -> str:
+        """Short hash of the code that trained it."""
+        commit, dash, dirty = (self.final["commit"] or "unknown").partition("-")
+        return commit[:7] + dash + dirty
+
 
 class Curve(NamedTuple):
-    """Gradient steps (E,), the mean over runs (E,) and the limits of its 95 % band (E,)."""
+    """Gradient steps (E,), the mean over runs (E,), the limits of a band around it (E,), and what the band is."""
 
     steps: np.ndarray
     mean: np.ndarray
     low: np.ndarray
     high: np.ndarray
+    band: str
 
 
 class Group(NamedTuple):
     """
-    All runs of one profile and label: one table, one figure.
+    All runs of one profile and label in a study: one table, one figure.
 
     :param profile: name of the settings
     :param label: name of what else was changed
@@ -93,6 +103,11 @@ class Group(NamedTuple):
         return f"{self.profile}, {self.label}" if self.label else self.profile
 
     @property
+    def algorithms(self) -> list[str]:
+        """The paper's, and others that were run."""
+        return list(dict.fromkeys([*PAPER_ALGORITHMS, *sorted(algo for _, _, algo in self.runs)]))
+
+    @property
     def regimes(self) -> list[float]:
         """Shares of the data, the paper's (unless something was changed) and those run, largest first."""
         paper = () if self.label else PAPER_REGIMES
@@ -100,8 +115,8 @@ class Group(NamedTuple):
 
     @property
     def compares(self) -> bool:
-        """Whether both algorithms were run."""
-        return {algo for _, _, algo in self.runs} == set(ALGORITHMS)
+        """Whether several algorithms were run."""
+        return len({algo for _, _, algo in self.runs}) > 1
 
     @property
     def success_tasks(self) -> list[str]:
@@ -115,6 +130,33 @@ class Group(NamedTuple):
     def of_task(self, task: str) -> list[Run]:
         """All runs on one task."""
         return [run for (each, _, _), runs in self.runs.items() if each == task for run in runs]
+
+
+class Study(NamedTuple):
+    """
+    What one folder of results holds.
+
+    :param name: of the folder, "" for what was named itself
+    :param groups: its runs by profile and label
+    :param unfinished: cells left out because they have no final evaluation
+    """
+
+    name: str
+    groups: list[Group]
+    unfinished: list[Cell]
+
+
+def read_studies(paths: Iterable[str | os.PathLike[str]], tasks: Sequence[str] = ()) -> list[Study]:
+    """
+    The studies in files and folders of rows; those with runs of a profile as it is come first.
+
+    :param paths: see :func:`~sb3_dtfm.benchmark.rows.result_files`
+    :param tasks: see :func:`group_runs`
+    :raises FileNotFoundError: one of them does not exist
+    :raises RowError: a malformed row, or two different results of the same evaluation in one study
+    """
+    studies = [Study(name, *group_runs(merge_rows(files), tasks)) for name, files in result_files(paths).items()]
+    return sorted(studies, key=lambda study: (all(group.label for group in study.groups), study.name))
 
 
 def row_value(row: Row) -> float:
@@ -133,17 +175,15 @@ def group_runs(rows: Iterable[Row], tasks: Sequence[str] = ()) -> tuple[list[Gro
     evaluations: dict[Cell, list[Row]] = {}
     finals: dict[Cell, Row] = {}
     for row in sorted(rows, key=lambda row: int(row["step"])):
-        cell = Cell.of(row)
-        evaluations.setdefault(cell, [])
+        during = evaluations.setdefault(Cell.of(row), [])
         if row["final"]:
-            finals[cell] = row
+            finals[Cell.of(row)] = row
         else:
-            evaluations[cell].append(row)
+            during.append(row)
     groups: dict[tuple[str, str], Group] = {}
     for cell in sorted(finals):
         group = groups.setdefault((cell.profile, cell.label), Group(cell.profile, cell.label, [], {}))
-        if cell.task not in group.tasks:
-            group.tasks.append(cell.task)
+        group.tasks.append(cell.task)
         group.runs.setdefault((cell.task, cell.regime, cell.algo), []).append(Run(cell, evaluations[cell], finals[cell]))
     for group in groups.values():
         # What was changed for a label may not be meant for all tasks.
@@ -175,9 +215,7 @@ def late_interval(runs: Sequence[Run]) -> Interval | None:
     if not values:
         return None
     interval = student_t(values)
-    if runs[0].counts_success:
-        interval = Interval(*np.clip(interval, 0.0, 100.0).tolist())
-    return interval
+    return Interval(*np.clip(interval, 0.0, 100.0).tolist()) if runs[0].counts_success else interval
 
 
 def _pooled_success(rows: Sequence[Row]) -> Interval:
@@ -199,36 +237,40 @@ def learning_curve(runs: Sequence[Run]) -> Curve:
     """
     Mean over runs at each gradient step at which all of them were evaluated.
 
-    The band is :func:`final_interval`'s at each step; that of a single run's returns is over its episodes.
+    The band is Wilson's interval over the episodes of all runs for success; for returns it is Student's over the episodes of
+    a single run, and what the runs reached where there are several: an interval over two or three seeds says little more.
     """
     by_step = [{row["step"]: row for row in run.evaluations} for run in runs]
     steps = sorted(set.intersection(*(set(rows) for rows in by_step)))
+    several = len(runs) > 1 and not all(run.counts_success for run in runs)
     points = []
     for step in steps:
         rows = [each[step] for each in by_step]
-        mean = float(np.mean([row_value(row) for row in rows]))
-        if all(row["successes"] is not None for row in rows):
+        values = [row_value(row) for row in rows]
+        if several:
+            interval = Interval(float(np.mean(values)), min(values), max(values))
+        elif runs[0].counts_success:
             interval = _pooled_success(rows)
         else:
-            interval = student_t([row_value(row) for row in rows] if len(rows) > 1 else rows[0]["returns"])
-        points.append((mean, interval.low, interval.high))
+            interval = student_t(rows[0]["returns"])
+        points.append((float(np.mean(values)), interval.low, interval.high))
     mean, low, high = np.array(points, float).reshape(-1, 3).T
-    return Curve(np.array(steps, int), mean, low, high)
+    return Curve(np.array(steps, int), mean, low, high, OVER_SEEDS if several else OVER_EPISODES)
 
 
-def paired_scores(group: Group, measure: str) -> tuple[list[tuple[str, float]], list[np.ndarray], list[np.ndarray]]:
+def paired_scores(
+    group: Group, algo: str, other: str, measure: str
+) -> tuple[list[tuple[str, float]], list[np.ndarray], list[np.ndarray]]:
     """
-    Scores of the cells that both algorithms have run.
+    Scores of the cells that two algorithms have run.
 
-    :return: task and regime of each, and the runs' scores of DT and of DTFM
+    :return: task and regime of each, and the runs' scores of the first and of the second
     """
-    keys: list[tuple[str, float]] = []
-    scores: dict[str, list[np.ndarray]] = {algo: [] for algo in ALGORITHMS}
+    found = []
     for task in group.tasks:
         for regime in group.regimes:
-            found = {algo: [run.score(measure) for run in group.of(task, regime, algo)] for algo in ALGORITHMS}
-            if all(values and None not in values for values in found.values()):
-                keys.append((task, regime))
-                for algo, values in found.items():
-                    scores[algo].append(np.array(values, float))
-    return keys, scores["dt"], scores["dtfm"]
+            scores = [[run.score(measure) for run in group.of(task, regime, each)] for each in (algo, other)]
+            if all(values and None not in values for values in scores):
+                found.append(((task, regime), *(np.array(values, float) for values in scores)))
+    keys, mine, theirs = map(list, zip(*found, strict=True)) if found else ([], [], [])
+    return keys, mine, theirs

@@ -3,26 +3,28 @@
 from collections.abc import Sequence
 from typing import Any
 
-from sb3_dtfm.benchmark.runs import Group, Run
+from sb3_dtfm.benchmark.report.runs import Group, Run, Study
 
 # Settings that tell cells apart, not labels.
 NOT_A_CHANGE = ("dataset", "dataset_fraction", "dataset_seed")
 
 
-def split_changes(groups: Sequence[Group]) -> tuple[list[Group], list[tuple[Group, list[Group]]]]:
+def split_changes(study: Study, studies: Sequence[Study]) -> tuple[list[Group], list[tuple[Group, list[Group]]]]:
     """
-    Groups that stand for themselves, and those to be compared with the same profile without a label.
+    Groups of a study that stand for themselves, and those to be compared with the same profile without a label.
 
-    A label that was run for both algorithms, on other data perhaps, compares them anew; for one, it changes a setting.
+    A label that was run for several algorithms, on other data perhaps, compares them anew; for one, it changes a setting.
 
+    :param studies: all of them; where the study has no runs without a label, those of another one serve
     :return: the former; and each group without a label, with its labelled ones if it has any
     """
-    plain = {group.profile: group for group in groups if not group.label}
-    alone = [group for group in groups if not group.label or group.compares or group.profile not in plain]
+    everywhere = [group for each in [*studies, study] for group in each.groups]
+    plain = {group.profile: group for group in everywhere if not group.label}
+    alone = [group for group in study.groups if not group.label or group.compares or group.profile not in plain]
     changed = [
         (base, labelled)
         for base in plain.values()
-        if (labelled := [group for group in groups if group not in alone and group.profile == base.profile])
+        if (labelled := [group for group in study.groups if group not in alone and group.profile == base.profile])
     ]
     return alone, changed
 

@@ -1,0 +1,315 @@
+"""The tables of a report, in Markdown."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import numpy as np
+
+from sb3_dtfm.benchmark.report.changes import changed_settings, compared_cells, split_changes
+from sb3_dtfm.benchmark.report.runs import (
+    MEASURES,
+    N_LATE,
+    Group,
+    Run,
+    Study,
+    final_interval,
+    late_interval,
+    paired_scores,
+    spread,
+    steps_to_success,
+)
+from sb3_dtfm.benchmark.report.statistics import (
+    Interval,
+    bootstrap,
+    interquartile_mean,
+    n_single_runs,
+    probability_of_improvement,
+)
+
+NOT_RUN = "*not run*"
+NONE = "-"
+CAPTION = (
+    "Mean over seeds of the evaluations before and during training. The band is a 95 % interval over episodes (Wilson's, of "
+    "all seeds, for success; Student's t, of the one seed, for returns), or the returns that several seeds reached."
+)
+SOLVED_CAPTION = (
+    "Share of the final episodes, of all seeds, that had succeeded by an environment step, and the median of it."
+)
+
+Say = Callable[[list[Run]], str]
+
+
+def make_report(studies: Sequence[Study], figures: Mapping[tuple[str, str], Sequence[str]]) -> str:
+    """
+    The whole report.
+
+    :param studies: what to report on, in this order
+    :param figures: file names by study and title of a group: of its learning curves, and of its successes by step if any
+    :return: Markdown
+    """
+    parts = ["# DT and DTFM compared", ""]
+    for study in studies:
+        level = "###" if study.name else "##"
+        parts += [f"## Study: {study.name}", ""] if study.name else []
+        alone, changed = split_changes(study, studies)
+        for group in alone:
+            parts += [f"{level} Settings: {group.title}", "", *_group(group, figures[study.name, group.title])]
+        for base, labelled in changed:
+            parts += [f"{level} Changes to: {base.title}", "", *_changes(base, labelled), ""]
+        if study.unfinished:
+            parts += ["Left out, as they have no final evaluation: " + "; ".join(map(str, study.unfinished)) + ".", ""]
+    return "\n".join(parts)
+
+
+def _group(group: Group, figures: Sequence[str]) -> list[str]:
+    curves, *solved = figures
+    parts = [f"![learning curves]({curves})", "", CAPTION, "", *_achieved(group), "", *_intervals(group), ""]
+    for file in solved:
+        parts += [f"![episodes solved by environment step]({file})", "", SOLVED_CAPTION, "", *_steps(group), ""]
+    for part in (_scores, _aggregates, _time, _sources):
+        parts += [*part(group), ""]
+    return parts
+
+
+def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    return [f"| {' | '.join(line)} |" for line in (header, ["---"] * len(header), *rows)]
+
+
+def _cell_table(
+    group: Group,
+    tasks: Sequence[str],
+    columns: Mapping[str, Say],
+    last: tuple[str, Callable[[list[list[Run]]], str]] | None = None,
+) -> list[str]:
+    """
+    A row for each task and share of the data.
+
+    :param columns: what to say of the runs of an algorithm, once for each algorithm
+    :param last: a column at the end, which is told the runs of all algorithms
+    """
+    header = ["task", "data", *(f"{algo.upper()} {name}" for name in columns for algo in group.algorithms)]
+    rows = []
+    for task in tasks:
+        for regime in group.regimes:
+            runs = [group.of(task, regime, algo) for algo in group.algorithms]
+            cells = [say(each) if each else NOT_RUN for say in columns.values() for each in runs]
+            rows.append([task, f"{regime:.0%}", *cells, *([last[1](runs)] if last else [])])
+    return _table([*header, last[0]] if last else header, rows)
+
+
+def _achieved(group: Group) -> list[str]:
+    """Table in the shape of the paper's."""
+    text = (
+        f"Mean ± standard deviation over seeds: success in percent, or mean return. The late average is the mean of the "
+        f"last {N_LATE} evaluations of a run. Seeds of {' / '.join(map(str.upper, group.algorithms))}."
+    )
+    columns = {name: lambda runs, measure=measure: _mean_and_deviation(runs, measure) for measure, name in MEASURES.items()}
+    seeds = ("seeds", lambda runs: " / ".join(str(len(each)) for each in runs))
+    return [text, "", *_cell_table(group, group.tasks, columns, seeds)]
+
+
+def _mean_and_deviation(runs: Sequence[Run], measure: str) -> str:
+    if not runs:
+        return NOT_RUN
+    found = spread(runs, measure)
+    if found is None:
+        return NONE
+    mean, deviation = found
+    digits = 1 if runs[0].counts_success else _digits(mean)
+    return f"{mean:,.{digits}f}" if math.isnan(deviation) else f"{mean:,.{digits}f} ± {deviation:,.{digits}f}"
+
+
+def _percent(value: float) -> str:
+    return f"{value:.1f}"
+
+
+def _number(value: float) -> str:
+    return f"{value:,.{_digits(value)}f}"
+
+
+def _digits(value: float) -> int:
+    """Digits behind the point of a return of this size."""
+    return 0 if abs(value) >= 100 else 2
+
+
+def _intervals(group: Group) -> list[str]:
+    text = (
+        "95 % intervals. Late average: Student's t over seeds. Final evaluation: Wilson's over the episodes of all seeds "
+        "for success, Student's t over seeds for returns."
+    )
+    columns = {MEASURES["late"]: _late, MEASURES["final"]: _final}
+    return [text, "", *_cell_table(group, group.tasks, columns)]
+
+
+def _late(runs: Sequence[Run]) -> str:
+    interval = late_interval(runs)
+    return NONE if interval is None else _over_seeds(interval, runs)
+
+
+def _final(runs: Sequence[Run]) -> str:
+    interval = final_interval(runs)
+    if not runs[0].counts_success:
+        return _over_seeds(interval, runs)
+    return f"{_bracket(interval, _percent)} % of {sum(len(run.final['returns']) for run in runs)} episodes"
+
+
+def _over_seeds(interval: Interval, runs: Sequence[Run]) -> str:
+    why = "one seed" if len(runs) == 1 else "all seeds alike"
+    return _bracket(interval, _percent if runs[0].counts_success else _number, f" ({why}, no interval)")
+
+
+def _bracket(interval: Interval, format_: Callable[[float], str], without: str = "") -> str:
+    """
+    :param without: what to say where the data give no interval
+    """
+    limits = without if math.isnan(interval.low) else f" [{format_(interval.low)}, {format_(interval.high)}]"
+    return format_(interval.estimate) + limits
+
+
+def _steps(group: Group) -> list[str]:
+    """Table of how soon the median episode succeeds."""
+    return _cell_table(group, group.success_tasks, {"median steps to success": _median_steps})
+
+
+def _median_steps(runs: Sequence[Run]) -> str:
+    median = float(np.median(steps_to_success(runs)))
+    return f"{median:.0f}" if math.isfinite(median) else NONE
+
+
+def _scores(group: Group) -> list[str]:
+    """Returns as shares of what the data's own agent reached."""
+    tasks = [task for task in group.tasks if not any(run.counts_success for run in group.of_task(task))]
+    if not tasks:
+        return ["Success needs no scale: the score of a run is its success rate."]
+    text = (
+        "Normalised scores: 0 is a return of 0, 1 is the mean return of the recorded episodes (of the whole dataset, "
+        "whatever share was learned from). Mean over seeds."
+    )
+    columns = {MEASURES[measure]: lambda runs, measure=measure: _share(runs, measure) for measure in ("late", "final")}
+    return [text, "", *_cell_table(group, tasks, columns, ("1.00 is", _scale))]
+
+
+def _share(runs: Sequence[Run], measure: str) -> str:
+    scores = [score for run in runs if (score := run.score(measure)) is not None]
+    return f"{np.mean(scores):.2f}" if scores else NONE
+
+
+def _scale(runs_of_all: Sequence[Sequence[Run]]) -> str:
+    """The returns that count as 1, and whose they are."""
+    data = [run.final["data"] for runs in runs_of_all for run in runs]
+    scales = dict.fromkeys((each.get("mean_return"), each.get("recorded_from", "not named")) for each in data)
+    named = [
+        f"{_number(mean_return)} ({_escape(source)})"
+        for mean_return, source in scales
+        if isinstance(mean_return, float | int) and mean_return > 0
+    ]
+    return "; ".join(named) or NONE
+
+
+def _escape(text: object) -> str:
+    """Text that may stand in a table."""
+    return " ".join(str(text).split()).replace("|", "\\|")
+
+
+def _aggregates(group: Group) -> list[str]:
+    """Each algorithm beside the first: their interquartile means, and how probably its runs are the better ones."""
+    first, *others = group.algorithms
+    parts = [part for algo in others for part in _aggregates_of(group, algo, first)]
+    return parts[:-1] or [f"Aggregates over tasks: {NOT_RUN} (no task has runs of two algorithms with a scale)."]
+
+
+def _aggregates_of(group: Group, algo: str, base: str) -> list[str]:
+    rows, text = [], ""
+    for measure in ("late", "final"):
+        keys, scores, others = paired_scores(group, algo, base, measure)
+        if not keys:
+            continue
+        tasks = [task for task, _ in keys]
+        aggregates = [
+            _aggregate(tasks, interquartile_mean, others),
+            _aggregate(tasks, interquartile_mean, scores),
+            _aggregate(tasks, probability_of_improvement, scores, others),
+        ]
+        rows.append([MEASURES[measure], *aggregates])
+        claim = "tasks like these, drawn anew with their runs" if len(set(tasks)) > 1 else "this task alone"
+        text = (
+            f"Aggregates of scores (success rate, or share of the recorded return) over what both have run: "
+            f"{_count(len(keys), 'cell')} (task and share of the data) of {_count(len(set(tasks)), 'task')}, "
+            f"{_count(sum(map(len, [*scores, *others])), 'run')}. Interquartile mean, and probability that a run of "
+            f"{algo.upper()} beats one of {base.upper()}; in brackets 95 % intervals for {claim} (Agarwal et al., 2021)."
+        )
+    header = ["score", f"{base.upper()} IQM", f"{algo.upper()} IQM", f"P({algo.upper()} > {base.upper()})"]
+    return [text, "", *_table(header, rows), ""] if rows else []
+
+
+def _aggregate(tasks: Sequence[str], statistic: Callable[..., float], *scores: Sequence[np.ndarray]) -> str:
+    n_single = n_single_runs(*scores)
+    without = f" (no interval: {_count(n_single, 'cell')} {'has' if n_single == 1 else 'have'} a single run)"
+    return _bracket(bootstrap(statistic, tasks, *scores), lambda value: f"{value:.2f}", without)
+
+
+def _count(n: int, noun: str) -> str:
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def _time(group: Group) -> list[str]:
+    text = (
+        "Wall-clock time of training without evaluations, mean over seeds; the last columns are success (or the share of "
+        "the recorded return) of the final evaluation, in percent, for each minute of training. Compare only what ran on "
+        "the same machine."
+    )
+    columns: dict[str, Say] = {
+        "minutes": lambda runs: f"{np.mean([run.minutes for run in runs]):.1f}",
+        "steps/s": lambda runs: f"{np.mean([run.final['steps_per_s'] for run in runs]):.1f}",
+        "score (%) per minute": _pace,
+    }
+    return [text, "", *_cell_table(group, group.tasks, columns)]
+
+
+def _pace(runs: Sequence[Run]) -> str:
+    paces = [100.0 * score / run.minutes for run in runs if (score := run.score("final")) is not None and run.minutes > 0]
+    return f"{np.mean(paces):.1f}" if paces else NONE
+
+
+def _changes(base: Group, labelled: Sequence[Group]) -> list[str]:
+    rows = []
+    for group in labelled:
+        for task, regime, algo, runs, same in compared_cells(base, group):
+            settings = _escape(changed_settings(runs[0], base.of(task, regime, algo)))
+            results = [_mean_and_deviation(each, measure) for measure in ("late", "final") for each in (runs, same)]
+            minutes = f"{np.mean([run.minutes for run in runs]):.1f}"
+            cell = [group.label, settings or NONE, task, f"{regime:.0%}", algo.upper()]
+            rows.append([*cell, *results, str(len(runs)), minutes, _commits(runs), _commits(same)])
+    measures = [f"{MEASURES[measure]}{which}" for measure in ("late", "final") for which in ("", " without")]
+    text = (
+        "What a label's settings did, beside the runs without it of the same seeds: mean ± standard deviation over seeds, "
+        "success in percent or mean return; minutes of training; commits of the code that trained them. Where these differ, "
+        "so may the code."
+    )
+    header = ["label", "settings", "task", "data", "algorithm", *measures, "seeds", "minutes", "commit", "commit without"]
+    return [text, "", *_table(header, rows)]
+
+
+def _commits(runs: Sequence[Run]) -> str:
+    return ", ".join(sorted({run.commit for run in runs})) or NONE
+
+
+def _sources(group: Group) -> list[str]:
+    """Data, code and machines behind the numbers."""
+    lines = ["Data, machines and code:", ""]
+    finals = [run.final for runs in group.runs.values() for run in runs]
+    for task in group.tasks:
+        data = {
+            f"`{each.get('dataset', 'not named')}`, {each.get('n_episodes', '?')} episodes, "
+            f"recorded from {_escape(each.get('recorded_from', 'an agent not named'))}"
+            for each in (run.final["data"] for run in group.of_task(task))
+        }
+        lines += [f"- {task}: {'; '.join(sorted(data)) or NOT_RUN}; commit {_commits(group.of_task(task))}"]
+    machines = {
+        f"{each.get('gpu') or each.get('cpu')} ({each.get('threads')} of {each.get('cores')} cores)"
+        for each in (row["hardware"] for row in finals)
+    }
+    solvers = {f"{row['solver']}, {row['n_solver_steps']} steps" for row in finals if row["solver"] is not None}
+    versions = {f"torch {row['versions'].get('torch', '?')}" for row in finals}
+    lines += [f"- machines: {'; '.join(sorted(machines))}", f"- solver: {'; '.join(sorted(solvers)) or NONE}"]
+    return [*lines, f"- versions: {', '.join(sorted(versions))}"]
