@@ -5,6 +5,8 @@ import numbers
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
+
 
 class Number(NamedTuple):
     """
@@ -56,18 +58,22 @@ class Choice(tuple[Any, ...]):
         return f"one of {', '.join(map(str, self))}"
 
 
+BOOLEAN = Choice((True, False))
 COUNT = Number(low=1, whole=True)
 POSITIVE = Number(low=0, above_low=True)
 NOT_NEGATIVE = Number(low=0)
 PROBABILITY_BELOW_1 = Number(low=0, high=1, below_high=True)
 
 
-def check_arguments(given: Mapping[str, Any], accepted: Mapping[str, Number | Choice]) -> None:
+def check_arguments(given: Mapping[str, Any], accepted: Mapping[str, Number | Choice]) -> dict[str, Any]:
     """
     :param given: values by name; others than `accepted` are left alone
     :param accepted: what each name may be
+    :return: the accepted ones, NumPy's numbers as Python's, which every file format can hold
     :raises ValueError: names the argument, what was given and what is accepted
     """
     for name, rule in accepted.items():
         if not rule.accepts(given[name]):
             raise ValueError(f"{name} must be {rule}, got {given[name]!r}.")
+    values = {name: given[name] for name in accepted}
+    return {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}

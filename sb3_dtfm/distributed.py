@@ -53,9 +53,11 @@ def first_of_each_machine_first() -> Iterator[None]:
     first = os.environ.get("LOCAL_RANK", "0") == "0"
     if not first:
         dist.barrier(group)
-    yield
-    if first:
-        dist.barrier(group)
+    try:
+        yield
+    finally:  # whatever became of it, the others must not wait for it
+        if first:
+            dist.barrier(group)
     dist.destroy_process_group(group)
 
 

@@ -19,7 +19,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import configure_logger, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_dtfm.arguments import COUNT, NOT_NEGATIVE, POSITIVE, PROBABILITY_BELOW_1, Choice, Number, check_arguments
+from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, POSITIVE, PROBABILITY_BELOW_1, Choice, Number, check_arguments
 from sb3_dtfm.callbacks import GradientStepProgressBar, NormalizedScoreCallback, find_eval_callbacks
 from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer, check_action_space, load_dataset
 from sb3_dtfm.distributed import (
@@ -49,6 +49,8 @@ ACCEPTED = {
     "learning_rate_schedule": Choice(LEARNING_RATE_SCHEDULES),
     "ema_decay": PROBABILITY_BELOW_1,
     "precision": Choice(PRECISIONS),
+    "compile": Choice((None, *BOOLEAN)),
+    "seed": Number(low=0, whole=True, optional=True),
 }
 
 
@@ -164,10 +166,10 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
                 normalization.set_return_to_go_range(buffer.return_to_go_range())
 
     def _check_arguments(self) -> None:
-        check_arguments(vars(self), ACCEPTED)
+        accepted = ACCEPTED if callable(self.learning_rate) else {**ACCEPTED, "learning_rate": POSITIVE}
+        vars(self).update(check_arguments(vars(self), accepted))
         if not callable(self.learning_rate):
-            check_arguments({"learning_rate": self.learning_rate}, {"learning_rate": POSITIVE})
-            self.learning_rate = float(self.learning_rate)  # SB3 refuses NumPy's numbers
+            self.learning_rate = float(self.learning_rate)  # SB3 takes no whole ones
         check_batch_size(self.batch_size)
 
     def set_dataset(self, dataset: Dataset) -> None:
@@ -194,7 +196,8 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         if getattr(self, "observation_space", None) is None:
             self.observation_space, self.action_space, self.n_envs = observation_space, buffer.action_space, 1
         self._check_spaces(observation_space, buffer.action_space, f"{buffer.source} holds", "the environment's are")
-        self._check_task(buffer)
+        if self.env is not None:
+            self._check_task(buffer, self.env)
         self.buffer = buffer.random_fraction(self.dataset_fraction, self.dataset_seed).to(self.device)
         return self.buffer
 
@@ -213,11 +216,12 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         if not same_bounds:
             raise DatasetError(f"{found} actions of {action_space}, {expected} {self.action_space}.")
 
-    def _check_task(self, buffer: TrajectoryBuffer) -> None:
+    @staticmethod
+    def _check_task(buffer: TrajectoryBuffer, env: VecEnv) -> None:
         """
-        :raises DatasetError: the data were recorded in another environment than the model's; versions may differ
+        :raises DatasetError: the data were recorded in another environment; versions may differ
         """
-        spec = None if self.env is None else self.env.get_attr("spec", indices=0)[0]
+        (spec,) = env.get_attr("spec", indices=0)
         if spec is None or buffer.env_id is None or parse_env_id(spec.id)[:2] == parse_env_id(buffer.env_id)[:2]:
             return
         raise DatasetError(
@@ -276,6 +280,8 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         """
         vec_env = self._wrap_env(env, self.verbose)
         self._check_spaces(vec_env.observation_space, vec_env.action_space, "The environment has", "the model's are")
+        if self.buffer is not None:
+            self._check_task(self.buffer, vec_env)
         self.observation_space, self.n_envs = vec_env.observation_space, vec_env.num_envs
         self.action_space = vec_env.action_space  # type: ignore[assignment]
         super().set_env(vec_env, force_reset)

@@ -37,11 +37,13 @@ class ActionHead(nn.Module, ABC):
         parameters = inspect.signature(cls).parameters.values()
         return {each.name: each.default for each in parameters if each.kind is inspect.Parameter.KEYWORD_ONLY}
 
-    def check_acting(self, **choices: Any) -> None:
+    def check_acting(self, **choices: Any) -> dict[str, Any]:
         """
         :param choices: all of `acting_choices`
+        :return: the same, as attributes of the head
         :raises ValueError: names the choice, what was given and what is accepted
         """
+        return choices
 
     def draw_noise(self, actions: th.Tensor, generator: th.Generator) -> tuple[th.Tensor, ...]:
         """

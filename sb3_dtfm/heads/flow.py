@@ -9,7 +9,7 @@ from typing import Any
 import torch as th
 from torch import nn
 
-from sb3_dtfm.arguments import COUNT, NOT_NEGATIVE, POSITIVE, Choice, check_arguments
+from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, POSITIVE, Choice, check_arguments
 from sb3_dtfm.heads.base import ActionHead, masked_mean
 from sb3_dtfm.heads.regression import RegressionHead
 from sb3_dtfm.networks.cpu import Linear
@@ -29,7 +29,7 @@ OPTIONS = {
     "flow_prediction": Choice(("velocity", "action")),
     "flow_tau_exponent": POSITIVE,
     "regression_coef": NOT_NEGATIVE,
-    "one_step": Choice((True, False)),
+    "one_step": BOOLEAN,
 }
 ACTING = {"solver": Choice((*SOLVERS, ONE_STEP)), "n_solver_steps": COUNT}
 
@@ -103,14 +103,15 @@ class FlowHead(ActionHead):
             nn.init.zeros_(self.vector_field.output.bias)
         self.one_step = FilmNetwork(*sizes) if one_step else None
         self.auxiliary = RegressionHead(embed_dim, action_dim) if regression_coef > 0 else None
-        self.check_acting(solver=solver, n_solver_steps=n_solver_steps)
-        self.solver = solver
-        self.n_solver_steps = n_solver_steps
+        acting = self.check_acting(solver=solver, n_solver_steps=n_solver_steps)
+        self.solver: str = acting["solver"]
+        self.n_solver_steps: int = acting["n_solver_steps"]
 
-    def check_acting(self, **choices: Any) -> None:
-        check_arguments(choices, ACTING)
+    def check_acting(self, **choices: Any) -> dict[str, Any]:
+        choices = check_arguments(choices, ACTING)
         if choices["solver"] == ONE_STEP and self.one_step is None:
             raise ValueError(f"solver={ONE_STEP!r} needs a model that was trained with policy_kwargs=dict(one_step=True).")
+        return choices
 
     def draw_noise(self, actions: th.Tensor, generator: th.Generator) -> tuple[th.Tensor, ...]:
         noise = th.randn(actions.shape, generator=generator, device=actions.device)

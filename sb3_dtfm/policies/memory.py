@@ -7,8 +7,8 @@ import numpy as np
 from sb3_dtfm.windows import Context
 
 ADVICE = (
-    "Without `state`, predict() remembers the context of one caller. Pass the `state` that it returns where several "
-    "environments take turns, and call model.policy.reset() to start anew."
+    "A context belongs to whoever passes `state`: pass the one that the last call for the same environment returned. "
+    "Without `state`, predict() remembers one caller, until model.policy.reset()."
 )
 
 

@@ -12,7 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_dtfm.arguments import COUNT, NOT_NEGATIVE, PROBABILITY_BELOW_1, check_arguments
+from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, PROBABILITY_BELOW_1, check_arguments
 from sb3_dtfm.heads import ActionHead
 from sb3_dtfm.networks.trunk import TOKENS_PER_STEP, SequenceTrunk
 from sb3_dtfm.policies.memory import RememberedContext
@@ -28,7 +28,10 @@ ACCEPTED = {
     "n_layers": COUNT,
     "n_heads": COUNT,
     "dropout": PROBABILITY_BELOW_1,
+    "timestep_embedding": BOOLEAN,
     "weight_decay": NOT_NEGATIVE,
+    "clip_return_to_go": BOOLEAN,
+    "kv_cache": BOOLEAN,
 }
 # What the algorithm gives to the policy by itself; everything else is for `policy_kwargs`.
 FROM_ALGORITHM = ("context_length", "max_timestep", "weight_decay", "ema", "seed")
@@ -99,11 +102,11 @@ class SequencePolicy(BasePolicy):
     ) -> None:
         super().__init__(observation_space, action_space, normalize_images=False, optimizer_class=th.optim.AdamW)
         arguments = {name: value for name, value in locals().items() if name in _own_parameters()}
-        check_arguments(arguments, ACCEPTED)
+        arguments.update(check_arguments(arguments, ACCEPTED))
         self._check_names(head_options)
         self._constructor_arguments = {**arguments, **self.head_class.options(), **head_options}
         self.context_length = context_length
-        self.weight_decay = weight_decay
+        self.weight_decay = arguments["weight_decay"]
         self.kv_cache = kv_cache
         self.seed = seed
         self.observation_dim = int(observation_space["observation"].shape[0])  # type: ignore[index]
@@ -344,16 +347,16 @@ class SequencePolicy(BasePolicy):
         :param settings: some of :meth:`acting_settings`
         :raises ValueError: an unknown name, or a value out of range
         """
+        unknown = sorted(set(settings) - set(self.acting_settings()))
+        if unknown:
+            raise ValueError(f"{', '.join(unknown)}: no way of acting; accepted are {', '.join(self.acting_settings())}.")
         settings = {**self.acting_settings(), **settings}
-        self.network.head.check_acting(**{name: settings[name] for name in self.head_class.acting_choices})
-        for name, value in settings.items():
-            if name == "kv_cache":
-                self.kv_cache = value
-            elif name in self.head_class.acting_choices:
-                setattr(self.network.head, name, value)
-                setattr(self.acting_network.head, name, value)
-            else:
-                raise ValueError(f"{name} is no way of acting; accepted are {', '.join(self.acting_settings())}.")
+        own = check_arguments(settings, {"kv_cache": BOOLEAN})
+        heads = self.network.head.check_acting(**{name: settings[name] for name in self.head_class.acting_choices})
+        self.kv_cache = own["kv_cache"]
+        for name, value in heads.items():
+            setattr(self.network.head, name, value)
+            setattr(self.acting_network.head, name, value)
 
     def get_extra_state(self) -> th.Tensor:
         """The settings of acting as JSON, to be saved with the weights; in a tensor, as all of a state dict is."""
