@@ -33,9 +33,9 @@ def enjoy(arguments: Sequence[str]) -> None:
     _call(rl_zoo3.enjoy.enjoy, "enjoy", arguments)
 
 
-def _find_model(exp_id: int, folder: str, *choice: Any) -> tuple[str, str, str]:
+def _find_model(exp_id: int, folder: str, *args: Any, **kwargs: Any) -> tuple[str, str, str]:
     try:
-        return get_model_path(exp_id, folder, *choice)
+        return get_model_path(exp_id, folder, *args, **kwargs)
     except (AssertionError, ValueError) as error:
         if "rl-trained-agents" in folder:  # RL-Zoo waits for such an error to download the agent
             raise
