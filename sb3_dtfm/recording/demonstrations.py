@@ -41,9 +41,7 @@ class DemonstratedTask(NamedTuple):
 def demonstrated_tasks() -> dict[str, DemonstratedTask]:
     """All of them, by their name in lower case."""
     return {
-        name.lower(): DemonstratedTask(name, row.demonstrator)
-        for name, row in TASKS.items()
-        if row.demonstrator is not None
+        name.lower(): DemonstratedTask(name, row.demonstrator) for name, row in TASKS.items() if row.demonstrator is not None
     }
 
 
