@@ -17,14 +17,14 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
     A Panda arm on one of robosuite's tasks, moved by an OSC_POSE delta controller at 20 Hz.
 
     Actions (7,) lie in [-1, 1]: position change (1 is 0.05 m), rotation change as an axis-angle vector (1 is 0.5 rad),
-    gripper (positive closes); Wipe's are (6,), for its wiper has no fingers. The reward is 1 at the step that solves the task, which terminates the episode with
-    `info["is_success"]`, and 0 before; `horizon` truncates.
+    gripper (positive closes); Wipe's are (6,), for its wiper has no fingers. The reward is 1 at the step that solves the
+    task, which terminates the episode with `info["is_success"]`, and 0 before; `horizon` truncates.
 
     Observations follow robomimic: `robot0_eef_pos` (3), `robot0_eef_quat` (4, x y z w), `robot0_gripper_qpos` (2), and
     robosuite 1.5's `object-state`; :attr:`observation_keys` has their widths. Lift, 19 in all: cube position (3), cube
     quaternion (4), gripper to cube (3). Can, 23 in all: can position (3) and quaternion (4) in the gripper's frame, then can
     position (3) and quaternion (4). All of them describe the state after the step. (robosuite's own `step` returns positions
-    from before it, and its first Can observation of an episode holds zeros; robomimic's files hold the state after the step.)
+    from before it, and its first relative poses of an episode are zeros; robomimic's files hold the state after the step.)
 
     Everything random comes from `np_random`, and an episode depends on nothing but its start:
     the same seed gives the same numbers in any process, whatever was run before.
@@ -122,8 +122,8 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
         Draw a new start, or take a recorded one.
 
         :param seed: restarts the environment's random stream; without it the stream goes on
-        :param options: `{"state": ...}` starts from a recorded :attr:`state`, and all of Wipe's dirt is there; `"model_file"`
-            beside it brings the scene it was recorded in: the size of Lift's cube, the place of the door or the dirt
+        :param options: `{"state": ...}` starts from a recorded :attr:`state`, with none of Wipe's dirt wiped; `"model_file"`
+            beside it brings what was recorded of the scene: the size of Lift's cube, the place of the door or of the dirt
         :return: observation and `{"is_success": False}`
         """
         super().reset(seed=seed)

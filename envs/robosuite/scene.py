@@ -28,7 +28,7 @@ def import_robosuite() -> ModuleType:
         return sys.modules["robosuite"]
     rendering_backend = os.environ.get("MUJOCO_GL")
     try:
-        with _silence(), _optional_opencv():
+        with silence(), _optional_opencv():
             import robosuite
     except ImportError as error:
         raise ImportError(
@@ -59,7 +59,7 @@ def _optional_opencv() -> Iterator[None]:
 
 
 @contextmanager
-def _silence() -> Iterator[None]:
+def silence() -> Iterator[None]:
     """Hold back robosuite's log messages below errors."""
     logger = logging.getLogger("robosuite_logs")
 
@@ -84,7 +84,7 @@ def make_robosuite(environment: str, controller_config: dict[str, Any] | None, l
     robosuite = import_robosuite()
     from robosuite.controllers.composite.composite_controller_factory import refactor_composite_controller_config
 
-    with _silence():
+    with silence():
         if controller_config is not None:
             controller_config = refactor_composite_controller_config(controller_config, "Panda", ["right"])
         return robosuite.make(

@@ -11,7 +11,7 @@ from sb3_dtfm.envs.robosuite.demonstrators import (
     SquareDemonstrator,
     StackDemonstrator,
 )
-from sb3_dtfm.envs.robosuite.scene import BodyPoses, CubeSize, SceneVariation
+from sb3_dtfm.envs.robosuite.scene import BodyPoses, CubeSize, SceneVariation, silence
 
 
 def check_success(env: Any) -> bool:
@@ -29,7 +29,8 @@ def wipe_and_check(env: Any) -> bool:
 
     :param env: robosuite's environment, which takes away the dirt under the wiper when it is asked for the reward
     """
-    env.reward()
+    with silence():  # it also warns about joint limits, at every step
+        env.reward()
     return check_success(env)
 
 
@@ -41,7 +42,7 @@ class RobosuiteTask:
     What is observed of its objects is robosuite's `object-state`, and where they lie is drawn by robosuite.
 
     :param environment: robosuite's name
-    :param horizon: steps after which an unsolved episode is truncated: 400, as in robomimic, for each object to move
+    :param horizon: steps after which an unsolved episode is truncated: robomimic's, or 400 for each object to move
     :param variation: what one episode's scene has otherwise than another's, beside its state
     :param is_solved: from robosuite's environment after a step
     :param demonstrator: who shows how it is done

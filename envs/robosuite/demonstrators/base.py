@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sb3_dtfm.envs.robosuite.demonstrators.rotations import DOWNWARD, rotation_between
+
 # Action units per unit of error: one unit of action settles at 0.306 m/s and 3.06 rad/s (stiffness 150, critically damped).
 METRES_PER_SECOND = 0.306
 RADIANS_PER_SECOND = 3.06
@@ -18,7 +20,6 @@ GRASP_TOLERANCE = 0.015  # metres from the grasp point, horizontally: the opened
 MISJUDGEMENT_RATE = 0.07  # of episodes whose first grasp closes on air, which shows how to begin again
 FINGERS_OPEN = 0.03  # metres from the middle
 FINGERS_STILL = 4e-4  # metres per step
-DOWNWARD = np.array([1.0, 0.0, 0.0, 0.0])  # hand pointing down, as x y z w
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,9 @@ class Manner:
 
 class Demonstrator:
     """
-    Hover above the object, descend, grasp; what follows is the task's. It sees the observation alone and acts through OSC_POSE.
+    Hover above the object, descend, grasp; what follows is the task's.
+
+    It sees the observation alone, and acts through OSC_POSE.
 
     A grasp that closes on nothing, or an object lost on the way, leads back to the hover point.
 
@@ -141,7 +144,7 @@ class Demonstrator:
         fingers = float(observation[7] - observation[8]) / 2.0
         finger_speed, self._fingers = abs(fingers - self._fingers), fingers
         position = self._look(observation)
-        turn = _rotation_between(observation[3:7], self._orientation)
+        turn = rotation_between(observation[3:7], self._orientation)
         self._to_turn = float(np.linalg.norm(turn))
         stage = self._next_stage(hand, position, fingers, finger_speed)
         self._steps_in_stage = self._steps_in_stage + 1 if stage == self.stage else 0
@@ -150,7 +153,11 @@ class Demonstrator:
         return self._move(target - hand, turn, gripper)
 
     def _look(self, observation: np.ndarray) -> np.ndarray:
-        """Where the object is, (3,) metres. What else a task has to see, such as how the hand should turn, it sees here."""
+        """
+        Where to grasp the object or hold it, (3,) metres; the hand's orientation is chosen here too, where that matters.
+
+        :param observation: (O,) float64
+        """
         return observation[self.object_columns]
 
     def _next_stage(self, hand: np.ndarray, position: np.ndarray, fingers: float, finger_speed: float) -> str:
@@ -241,49 +248,3 @@ class Demonstrator:
             self._jerk_steps = int(self._rng.integers(1, 4))
             return self._jerk
         return np.zeros(6)
-
-
-def _rotation_between(quaternion: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """
-    Axis-angle rotation in the world's frame that turns one orientation into another.
-
-    :param quaternion: (4,) x y z w
-    :param goal: (4,) x y z w
-    :return: (3,) radians
-    """
-    vector, scalar = -quaternion[:3], quaternion[3]  # of the inverse
-    turned = goal[3] * vector + scalar * goal[:3] + np.cross(goal[:3], vector)
-    cosine = float(goal[3] * scalar - goal[:3] @ vector)
-    if cosine < 0.0:
-        turned, cosine = -turned, -cosine
-    sine = float(np.linalg.norm(turned))
-    return turned * (2.0 * np.arctan2(sine, cosine) / max(sine, 1e-9))
-
-
-def downward(yaw: float) -> np.ndarray:
-    """
-    A hand that points down, turned about the vertical; its fingers open along the y axis for 0, and for half a turn.
-
-    :param yaw: radians
-    :return: (4,) x y z w
-    """
-    return np.array([np.cos(yaw / 2.0), np.sin(yaw / 2.0), 0.0, 0.0])
-
-
-def hand_yaw(quaternion: np.ndarray) -> float:
-    """
-    How far a hand that points down is turned about the vertical, radians.
-
-    :param quaternion: (4,) x y z w
-    """
-    return float(2.0 * np.arctan2(quaternion[1], quaternion[0]))
-
-
-def object_yaw(quaternion: np.ndarray) -> float:
-    """
-    How far an object that lies flat is turned about the vertical, radians in [-pi, pi].
-
-    :param quaternion: (4,) x y z w
-    """
-    x, y, z, w = quaternion
-    return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from sb3_dtfm.envs.robosuite.demonstrators.base import downward, hand_yaw, object_yaw
 from sb3_dtfm.envs.robosuite.demonstrators.placing import PlacingDemonstrator
+from sb3_dtfm.envs.robosuite.demonstrators.rotations import downward, hand_yaw, object_yaw
 
 PEG = np.array([0.23, 0.1])  # metres: its axis
 PEG_TOP = 0.95  # metres

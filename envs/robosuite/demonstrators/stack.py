@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from sb3_dtfm.envs.robosuite.demonstrators.base import downward, object_yaw
 from sb3_dtfm.envs.robosuite.demonstrators.placing import PlacingDemonstrator
+from sb3_dtfm.envs.robosuite.demonstrators.rotations import downward, object_yaw
 
 STACKED_HEIGHT = 0.87  # metres: of the small cube's centre where it lies on the large one
 

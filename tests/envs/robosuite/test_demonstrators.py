@@ -5,13 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sb3_dtfm.envs.demonstrators import DEMONSTRATORS, DOWNWARD, LiftDemonstrator, _rotation_between
-from sb3_dtfm.envs.robosuite import RobosuiteEnv
+from sb3_dtfm.envs.robosuite import TASKS
+from sb3_dtfm.envs.robosuite.demonstrators import LiftDemonstrator
+from sb3_dtfm.envs.robosuite.demonstrators.rotations import DOWNWARD, downward, hand_yaw, object_yaw, rotation_between
+from sb3_dtfm.envs.robosuite.demonstrators.stack import _grasp_yaw
 
 
 def demonstrate(env, seed, demonstrator_seed=None):
     observation, _ = env.reset(seed=seed)
-    demonstrator = DEMONSTRATORS[env.task](seed if demonstrator_seed is None else demonstrator_seed)
+    demonstrator = TASKS[env.task].demonstrator(seed if demonstrator_seed is None else demonstrator_seed)
     actions, terminated, truncated = [], False, False
     while not (terminated or truncated):
         actions.append(demonstrator.act(observation))
@@ -19,18 +21,20 @@ def demonstrate(env, seed, demonstrator_seed=None):
     return np.stack(actions), terminated
 
 
-def test_lift_succeeds(lift):
-    runs = [demonstrate(lift, seed) for seed in range(5)]
+@pytest.mark.parametrize(
+    ("task", "n_episodes", "mean_length"), [("Lift", 5, 73), ("Can", 2, 167), ("Stack", 3, 130), ("Square", 3, 180)]
+)
+def test_it_succeeds_in_good_time(task, n_episodes, mean_length, environment):
+    runs = [demonstrate(environment(task), seed) for seed in range(n_episodes)]
     assert all(success for _, success in runs)
-    assert np.mean([len(actions) for actions, _ in runs]) < 73
+    assert np.mean([len(actions) for actions, _ in runs]) < mean_length
 
 
-def test_can_succeeds():
-    env = RobosuiteEnv("Can")
-    runs = [demonstrate(env, seed) for seed in range(2)]
-    env.close()
-    assert all(success for _, success in runs)
-    assert np.mean([len(actions) for actions, _ in runs]) < 167
+@pytest.mark.slow
+@pytest.mark.parametrize(("task", "share"), [("Stack", 0.7), ("Square", 0.5)])
+def test_it_succeeds_often(task, share, environment):
+    runs = [demonstrate(environment(task), seed) for seed in range(100, 140)]
+    assert np.mean([success for _, success in runs]) >= share
 
 
 def test_actions_are_smooth_and_within_bounds(lift):
@@ -73,13 +77,27 @@ def test_cube_pushed_away_from_the_fingers_is_fetched(lift):
     assert "hover" in stages[stages.index("grasp") :]
 
 
-def test_rotation_between_orientations_is_the_world_rotation():
+def testrotation_between_orientations_is_the_world_rotation():
     half = 0.15  # of a turn of 0.3 rad around z, which leaves "downward" short by as much
     turn = np.array([0.0, 0.0, np.sin(half), np.cos(half)])
     turned = np.array([turn[3], turn[2], 0.0, 0.0])  # turn * DOWNWARD, as quaternions
-    np.testing.assert_allclose(_rotation_between(turned, DOWNWARD), [0.0, 0.0, -0.3], atol=1e-12)
-    np.testing.assert_allclose(_rotation_between(-turned, DOWNWARD), [0.0, 0.0, -0.3], atol=1e-12)
-    np.testing.assert_allclose(_rotation_between(DOWNWARD, DOWNWARD), np.zeros(3), atol=1e-12)
+    np.testing.assert_allclose(rotation_between(turned, DOWNWARD), [0.0, 0.0, -0.3], atol=1e-12)
+    np.testing.assert_allclose(rotation_between(-turned, DOWNWARD), [0.0, 0.0, -0.3], atol=1e-12)
+    np.testing.assert_allclose(rotation_between(DOWNWARD, DOWNWARD), np.zeros(3), atol=1e-12)
+
+
+def test_yaw_is_the_turn_about_the_vertical():
+    for angle in (-3.0, -0.4, 0.0, 1.2, 2.9):
+        assert hand_yaw(downward(angle)) == pytest.approx(angle)
+        assert object_yaw(np.array([0.0, 0.0, np.sin(angle / 2), np.cos(angle / 2)])) == pytest.approx(angle)
+
+
+def test_fingers_take_faces_of_the_cube_and_leave_out_its_neighbour():
+    for cube, neighbour in np.random.default_rng(0).uniform(-np.pi, np.pi, (50, 2)):
+        hand = _grasp_yaw(cube, neighbour)
+        assert abs(hand) <= np.pi / 2
+        assert abs(np.sin(2.0 * (hand - cube))) < 1e-9  # square with the cube
+        assert abs(np.cos(hand - neighbour)) >= np.cos(np.pi / 4) - 1e-9  # the fingers are beside that line
 
 
 def test_the_hand_pauses_as_long_as_stated():
