@@ -179,11 +179,13 @@ class EvaluationCallback(BaseCallback):
         what = f"{'final ' if final else ''}evaluation"
         seeds = range(first, first + n_episodes)
         episodes = evaluate(self.model, self.vec_env, seeds, lambda n_done: self._report(f"{what} {n_done}/{n_episodes}"))
+        acting = self.model.policy.acting_settings()  # type: ignore[operator]
         evaluation = dict(
             step=self.num_timesteps,
             final=final,
             **episodes._asdict(),
-            **{name: self.model.policy.acting_settings().get(name) for name in ("solver", "n_solver_steps")},
+            solver=acting.get("solver"),
+            n_solver_steps=acting.get("n_solver_steps"),
             wall_s=round(self._training_seconds, 3),
             steps_per_s=round(self.num_timesteps / self._training_seconds, 3),
             hardware=provenance.hardware(self.model.device),

@@ -31,7 +31,7 @@ def benchmark_parser() -> argparse.ArgumentParser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    several = dict(nargs="+", action="extend", default=[])
+    several: dict[str, Any] = dict(nargs="+", action="extend", default=[])
     algos = list(ALGORITHMS)
     grid = parser.add_argument_group("the grid").add_argument
     grid("--env", "--tasks", dest="tasks", nargs="+", metavar="TASK", help="those with a dataset given, by default")

@@ -32,8 +32,8 @@ def main(argv: Sequence[str]) -> None:
     argument(
         "--env", "--tasks", dest="tasks", nargs="+", default=[], metavar="TASK", help="show these first, even if not run"
     )
-    several = dict(action="append", default=[], metavar="[TASK:]NAME=FILE")
-    argument("--baseline", **several, help="curve of an SB3 run: its evaluations.npz")
+    baseline = "curve of an SB3 run: its evaluations.npz"
+    argument("--baseline", action="append", default=[], metavar="[TASK:]NAME=FILE", help=baseline)
     argument("--no-agent-line", action="store_true", help="do not draw the return of the recorded episodes")
     options = parser.parse_args(argv)
     studies = read_studies(options.results, options.tasks)

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from sb3_dtfm.benchmark.rows import Row
-from tests.zoo.conftest import minari_folder, workplace
+from tests.recorded import minari_folder, workplace
 
 
 def make_row(**changes: Any) -> Row:

@@ -22,7 +22,7 @@ from sb3_dtfm.benchmark.settings import Task, task_settings
 from sb3_dtfm.cli.benchmark import parse_arguments
 from sb3_dtfm.cli.main import main
 from sb3_dtfm.zoo.arguments import UsageError
-from tests.zoo.conftest import DATASET_ID
+from tests.recorded import DATASET_ID
 
 TASK = "HalfCheetah-v5"
 POLICY = dict(embed_dim=16, n_layers=1, n_heads=1, flow_hidden_dim=16, flow_n_layers=1, n_solver_steps=2)

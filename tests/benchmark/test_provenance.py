@@ -11,7 +11,7 @@ import torch as th
 
 from sb3_dtfm.benchmark import provenance
 from sb3_dtfm.data import DatasetError
-from tests.zoo.conftest import DATASET_ID
+from tests.recorded import DATASET_ID
 
 
 def write_demonstrations(path: Path, env_args: str | None) -> None:

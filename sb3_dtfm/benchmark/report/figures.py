@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,10 @@ BASELINE_COLORS = ("#009E73", "#CC79A7", "#E69F00")
 AGENT_COLOR = "0.35"
 PANEL = (4.15, 2.5)  # inches; two panels are as wide as a README
 # How a band is drawn; the legend shows it in grey.
-BANDS = {OVER_EPISODES: dict(alpha=0.15, linewidth=0), OVER_SEEDS: dict(alpha=0.3, linewidth=0, hatch="////")}
+BANDS: dict[str, dict[str, Any]] = {
+    OVER_EPISODES: dict(alpha=0.15, linewidth=0),
+    OVER_SEEDS: dict(alpha=0.3, linewidth=0, hatch="////"),
+}
 
 
 class Baseline(NamedTuple):
