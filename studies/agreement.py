@@ -16,9 +16,9 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.data import TrajectoryBuffer, load_dataset
 from sb3_dtfm.recording.loading import load_agent
-from sb3_dtfm.zoo.registration import OFFLINE_ALGORITHMS
 
 N_WINDOWS = 4096
 # So long do the locomotion tasks' agents take to find their gait.
@@ -51,9 +51,9 @@ def share_at_bounds(buffer: TrajectoryBuffer) -> float:
 def algorithm_of(path: Path) -> type[BaseAlgorithm]:
     """The class of a saved model, by the folder it is in."""
     for part in path.parts:
-        if part in OFFLINE_ALGORITHMS:
-            return OFFLINE_ALGORITHMS[part]
-    raise SystemExit(f"{path}: of which algorithm? Expected a path with a folder {' or '.join(OFFLINE_ALGORITHMS)}.")
+        if part in ALGORITHMS:
+            return ALGORITHMS[part]
+    raise SystemExit(f"{path}: of which algorithm? Expected a path with a folder {' or '.join(ALGORITHMS)}.")
 
 
 def main() -> None:

@@ -7,7 +7,8 @@ from pathlib import Path
 import gymnasium as gym
 import yaml
 
-from sb3_dtfm.zoo.registration import OFFLINE_ALGORITHMS, PACKAGED_CONFIGS, packaged_config
+from sb3_dtfm.algorithms import ALGORITHMS
+from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, packaged_config
 
 TRAIN_EXAMPLES = """\
   sb3-dtfm train --algo dtfm --env HalfCheetah-v5
@@ -29,7 +30,7 @@ def train_parser() -> argparse.ArgumentParser:
         epilog=f"examples:\n{TRAIN_EXAMPLES}\nRL-Zoo's own options follow.\n",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    offline = parser.add_argument_group(f"of {' and '.join(OFFLINE_ALGORITHMS)}").add_argument
+    offline = parser.add_argument_group(f"of {' and '.join(ALGORITHMS)}").add_argument
     offline("--dataset", help="Minari id or robomimic hdf5 file to learn from")
     offline("--dataset-fraction", type=float, help="randomly drawn share of the episodes, in (0, 1]")
     offline("--dataset-cache", metavar="DIR", help="learn from memory-mapped files made in this folder")
@@ -58,12 +59,12 @@ def train_arguments(argv: Sequence[str]) -> list[str]:
     """
     options, rest = train_parser().parse_known_args(argv)
     shorthands = _shorthands(options)
-    if options.algo not in OFFLINE_ALGORITHMS and shorthands:
+    if options.algo not in ALGORITHMS and shorthands:
         names = ", ".join(option for option, _ in shorthands)
-        raise UsageError(f"{names}: for --algo {' and '.join(OFFLINE_ALGORITHMS)} only, not for {options.algo}.")
+        raise UsageError(f"{names}: for --algo {' and '.join(ALGORITHMS)} only, not for {options.algo}.")
     hyperparams = [*options.hyperparams, *(value for _, value in shorthands)]
     conf_file = options.conf_file
-    if options.algo in OFFLINE_ALGORITHMS and conf_file in PACKAGED_CONFIGS:
+    if options.algo in ALGORITHMS and conf_file in PACKAGED_CONFIGS:
         conf_file = str(packaged_config(options.algo, conf_file))
         _check_task(conf_file, options.env, hyperparams)
     arguments = ["--algo", options.algo, "--env", options.env, *rest]
@@ -113,6 +114,6 @@ def enjoy_arguments(argv: Sequence[str]) -> list[str]:
     parser.add_argument("--algo")
     parser.add_argument("-f", "--folder")
     options, _ = parser.parse_known_args(argv)
-    if options.algo in OFFLINE_ALGORITHMS and options.folder is None:
+    if options.algo in ALGORITHMS and options.folder is None:
         return [*argv, "--folder", "logs"]
     return list(argv)

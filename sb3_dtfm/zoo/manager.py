@@ -9,9 +9,9 @@ from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback
 
+from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd
 from sb3_dtfm.distributed import is_first_process
-from sb3_dtfm.zoo.registration import OFFLINE_ALGORITHMS
 
 
 class TrainingError(RuntimeError):
@@ -44,7 +44,7 @@ class OfflineExperimentManager(ExperimentManager):
             return
         super().create_callbacks()
         evaluations = [callback for callback in self.callbacks if isinstance(callback, EvalCallback)]
-        if evaluations and self.algo in OFFLINE_ALGORITHMS:
+        if evaluations and self.algo in ALGORITHMS:
             self.callbacks.append(EvaluateAtStartAndEnd(evaluations))
 
     def learn(self, model: BaseAlgorithm) -> None:

@@ -14,7 +14,6 @@ from sb3_dtfm.policies import SequencePolicy
 
 # What `--conf-file` accepts besides files and Python packages; None is no `--conf-file` at all.
 PACKAGED_CONFIGS = {None: "sb3_dtfm.zoo_configs", "small": "sb3_dtfm.zoo_configs.small"}
-OFFLINE_ALGORITHMS = ALGORITHMS
 
 
 def register() -> None:

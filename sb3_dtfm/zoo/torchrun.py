@@ -11,9 +11,9 @@ from typing import Any, NoReturn
 import torch as th
 import torch.distributed as dist
 
+from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.distributed import is_first_process
 from sb3_dtfm.zoo.arguments import UsageError
-from sb3_dtfm.zoo.registration import OFFLINE_ALGORITHMS
 
 
 @contextlib.contextmanager
@@ -55,8 +55,8 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def _check(options: argparse.Namespace) -> None:
-    if options.algo not in OFFLINE_ALGORITHMS:
-        raise UsageError(f"torchrun trains {' and '.join(OFFLINE_ALGORITHMS)} on several processes, not {options.algo}.")
+    if options.algo not in ALGORITHMS:
+        raise UsageError(f"torchrun trains {' and '.join(ALGORITHMS)} on several processes, not {options.algo}.")
     if options.optimize_hyperparameters:
         raise UsageError(
             "-optimize: processes of a search share a --storage and a --study-name; start each by itself, not with torchrun."

@@ -11,9 +11,10 @@ import yaml
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import get_wrapper_class
 
+from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.heads import HEADS
-from sb3_dtfm.zoo.registration import OFFLINE_ALGORITHMS, packaged_config, policy_of, register
+from sb3_dtfm.zoo.registration import packaged_config, policy_of, register
 
 TARGETS = {
     "HalfCheetah-v5": 20000,
@@ -56,7 +57,7 @@ def record_three_steps(env: gym.Env) -> TrajectoryBuffer:
 def test_every_task_builds_its_model(env_id, settings):
     env = gym.make(env_id)
     buffer = record_three_steps(env)
-    for algo, algorithm in OFFLINE_ALGORITHMS.items():
+    for algo, algorithm in ALGORITHMS.items():
         hyperparams = load(algo, settings)[env_id]
         wrapped = get_wrapper_class(hyperparams)(env)
         assert wrapped.get_wrapper_attr("target_return") == TARGETS[env_id]
@@ -105,7 +106,7 @@ def test_the_papers_settings():
 
 @pytest.mark.filterwarnings("error")  # Optuna only warns of a value outside of the range
 @pytest.mark.parametrize("settings", SETTINGS)
-@pytest.mark.parametrize("algo", OFFLINE_ALGORITHMS)
+@pytest.mark.parametrize("algo", ALGORITHMS)
 def test_a_search_can_find_the_packaged_settings(algo, settings):
     """A trial's `policy_kwargs` replace the YAML's, so what the search leaves out there would be lost."""
     register()
