@@ -3,7 +3,7 @@
 import math
 import numbers
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -32,10 +32,11 @@ class Number(NamedTuple):
         if value is None:
             return self.optional
         kind = numbers.Integral if self.whole else numbers.Real
-        if not isinstance(value, kind) or isinstance(value, bool) or not math.isfinite(value):
+        if type(value) is bool or not isinstance(value, kind) or not math.isfinite(value):
             return False
-        at_least = value > self.low if self.above_low else value >= self.low
-        return at_least and (value < self.high if self.below_high else value <= self.high)
+        number = float(value)
+        at_least = number > self.low if self.above_low else number >= self.low
+        return at_least and (number < self.high if self.below_high else number <= self.high)
 
     def __str__(self) -> str:
         kind = "whole number" if self.whole else "number"
@@ -48,15 +49,20 @@ class Number(NamedTuple):
         return f"{text}, or None" if self.optional else text
 
 
-class Choice(tuple[Any, ...]):
-    """One of some values."""
+class Choice(NamedTuple):
+    """One of some values, of the same type."""
+
+    values: tuple[Any, ...]
 
     def accepts(self, value: Any) -> bool:
-        return any(type(value) is type(one) and value == one for one in self)
+        """Whether a value is one of them; 1 is not True."""
+        return any(type(value) is type(one) and value == one for one in self.values)
 
     def __str__(self) -> str:
-        return f"one of {', '.join(map(str, self))}"
+        return f"one of {', '.join(map(str, self.values))}"
 
+
+Rule: TypeAlias = Number | Choice
 
 BOOLEAN = Choice((True, False))
 COUNT = Number(low=1, whole=True)
@@ -65,7 +71,7 @@ NOT_NEGATIVE = Number(low=0)
 PROBABILITY_BELOW_1 = Number(low=0, high=1, below_high=True)
 
 
-def check_arguments(given: Mapping[str, Any], accepted: Mapping[str, Number | Choice]) -> dict[str, Any]:
+def check_arguments(given: Mapping[str, Any], accepted: Mapping[str, Rule]) -> dict[str, Any]:
     """
     :param given: values by name; others than `accepted` are left alone
     :param accepted: what each name may be

@@ -19,7 +19,17 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import configure_logger, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, POSITIVE, PROBABILITY_BELOW_1, Choice, Number, check_arguments
+from sb3_dtfm.arguments import (
+    BOOLEAN,
+    COUNT,
+    NOT_NEGATIVE,
+    POSITIVE,
+    PROBABILITY_BELOW_1,
+    Choice,
+    Number,
+    Rule,
+    check_arguments,
+)
 from sb3_dtfm.callbacks import GradientStepProgressBar, NormalizedScoreCallback, find_eval_callbacks
 from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer, check_action_space, load_dataset
 from sb3_dtfm.distributed import (
@@ -37,7 +47,7 @@ from sb3_dtfm.windows import Windows
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineSequenceAlgorithm")
 Dataset: TypeAlias = str | PathLike[str] | minari.MinariDataset | TrajectoryBuffer
 
-ACCEPTED = {
+ACCEPTED: dict[str, Rule] = {
     "batch_size": COUNT,
     "weight_decay": NOT_NEGATIVE,
     "context_length": COUNT,
@@ -49,7 +59,7 @@ ACCEPTED = {
     "learning_rate_schedule": Choice(LEARNING_RATE_SCHEDULES),
     "ema_decay": PROBABILITY_BELOW_1,
     "precision": Choice(PRECISIONS),
-    "compile": Choice((None, *BOOLEAN)),
+    "compile": Choice((None, *BOOLEAN.values)),
     "seed": Number(low=0, whole=True, optional=True),
 }
 
@@ -201,7 +211,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         self.buffer = buffer.random_fraction(self.dataset_fraction, self.dataset_seed).to(self.device)
         return self.buffer
 
-    def _check_spaces(self, observation_space: spaces.Space, action_space: spaces.Space, found: str, expected: str) -> None:
+    def _check_spaces(self, observation_space: spaces.Space, action_space: spaces.Box, found: str, expected: str) -> None:
         """
         Compare with the model's spaces what the policy depends on: sizes, and the range of actions.
 
@@ -279,15 +289,16 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         :raises ValueError: it does not fit
         """
         vec_env = self._wrap_env(env, self.verbose)
-        self._check_spaces(vec_env.observation_space, vec_env.action_space, "The environment has", "the model's are")
+        action_space = check_action_space(vec_env.action_space, "the environment")
+        self._check_spaces(vec_env.observation_space, action_space, "The environment has", "the model's are")
         if self.buffer is not None:
             self._check_task(self.buffer, vec_env)
-        self.observation_space, self.n_envs = vec_env.observation_space, vec_env.num_envs
-        self.action_space = vec_env.action_space  # type: ignore[assignment]
+        self.observation_space, self.action_space = vec_env.observation_space, action_space
+        self.n_envs = vec_env.num_envs
         super().set_env(vec_env, force_reset)
 
     @classmethod
-    def load(  # type: ignore[override]
+    def load(
         cls: type[SelfAlgorithm],
         path: str | Path | io.BufferedIOBase,
         env: GymEnv | None = None,

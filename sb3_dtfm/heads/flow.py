@@ -9,7 +9,7 @@ from typing import Any
 import torch as th
 from torch import nn
 
-from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, POSITIVE, Choice, check_arguments
+from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, POSITIVE, Choice, Rule, check_arguments
 from sb3_dtfm.heads.base import ActionHead, masked_mean
 from sb3_dtfm.heads.regression import RegressionHead
 from sb3_dtfm.networks.cpu import Linear
@@ -23,7 +23,7 @@ DISTILLED_STEPS = 16
 # Newest steps of each window that it learns from: where acting asks it, and few enough to cost little.
 ONE_STEP_POSITIONS = 4
 
-OPTIONS = {
+OPTIONS: dict[str, Rule] = {
     "flow_hidden_dim": COUNT,
     "flow_n_layers": COUNT,
     "flow_prediction": Choice(("velocity", "action")),
@@ -31,7 +31,7 @@ OPTIONS = {
     "regression_coef": NOT_NEGATIVE,
     "one_step": BOOLEAN,
 }
-ACTING = {"solver": Choice((*SOLVERS, ONE_STEP)), "n_solver_steps": COUNT}
+ACTING: dict[str, Rule] = {"solver": Choice((*SOLVERS, ONE_STEP)), "n_solver_steps": COUNT}
 
 
 def interpolate(noise: th.Tensor, action: th.Tensor, tau: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

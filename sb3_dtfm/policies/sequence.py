@@ -12,7 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, PROBABILITY_BELOW_1, check_arguments
+from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, PROBABILITY_BELOW_1, Rule, check_arguments
 from sb3_dtfm.heads import ActionHead
 from sb3_dtfm.networks.trunk import TOKENS_PER_STEP, SequenceTrunk
 from sb3_dtfm.policies.memory import RememberedContext
@@ -21,7 +21,7 @@ from sb3_dtfm.windows import Context, Windows, empty_context, push, restarts, un
 
 # Rows of the table that deterministic acting takes its noise from.
 NOISE_ROWS = 1024
-ACCEPTED = {
+ACCEPTED: dict[str, Rule] = {
     "context_length": COUNT,
     "max_timestep": COUNT,
     "embed_dim": COUNT,
