@@ -166,6 +166,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         self._training_seconds = 0.0
         if _init_setup_model:
             self._check_arguments()
+            self._check_learning_rate()
             buffer = self._load_buffer()
             self.max_timestep = int(buffer.episode_lengths.max())
             self.score_reference = buffer.score_reference
@@ -176,11 +177,14 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
                 normalization.set_return_to_go_range(buffer.return_to_go_range())
 
     def _check_arguments(self) -> None:
-        accepted = ACCEPTED if callable(self.learning_rate) else {**ACCEPTED, "learning_rate": POSITIVE}
-        vars(self).update(check_arguments(vars(self), accepted))
-        if not callable(self.learning_rate):
-            self.learning_rate = float(self.learning_rate)  # SB3 takes no whole ones
+        vars(self).update(check_arguments(vars(self), ACCEPTED))
         check_batch_size(self.batch_size)
+
+    def _check_learning_rate(self) -> None:
+        """Apart from the others: who loads a model to act with it may set 0, as RL-Zoo does."""
+        if not callable(self.learning_rate):
+            check_arguments({"learning_rate": self.learning_rate}, {"learning_rate": POSITIVE})
+            self.learning_rate = float(self.learning_rate)  # SB3 takes neither whole numbers nor NumPy's
 
     def set_dataset(self, dataset: Dataset) -> None:
         """
@@ -352,6 +356,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
         """SB3's set-up without the environment's first reset, which offline learning does not need."""
+        self._check_learning_rate()
         self.start_time = time.time_ns()
         if reset_num_timesteps:
             self.num_timesteps = 0
