@@ -1,3 +1,3 @@
-from tests.recorded import DATASET_ID, minari_folder, workplace
+from tests.recorded import minari_folder, workplace
 
-__all__ = ["DATASET_ID", "minari_folder", "workplace"]
+__all__ = ["minari_folder", "workplace"]
