@@ -141,11 +141,7 @@ def test_failed_recording_leaves_nothing(hurried, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-<<<<<<< HEAD
         ({"task": "door"}, "task must be one of 'lift', .*'can', got 'door'"),
-=======
-        ({"task": "door"}, "task must be one of 'lift', 'stack', 'square', 'can', got 'door'"),
->>>>>>> ffeae4f (robosuite: tests for every row of the table, in their room; rotations apart)
         ({"n_episodes": 0}, "n_episodes must be at least 1"),
         ({"noise": -0.1}, "noise must be a share of the action range, 0 or more, got -0.1"),
         ({"pause": float("nan")}, "pause must be a number of steps, 0 or more, got nan"),
