@@ -95,7 +95,7 @@ def test_rl_zoos_own_algorithms_still_train(workplace):
 
 
 def test_hyperparameters_can_be_searched(workplace, capsys):
-    small_model = ["--seed", "1"]
+    small_model = ["--seed", "30"]
     search = [
         "--optimize-hyperparameters",
         "--n-trials",
