@@ -7,6 +7,7 @@ import torch as th
 
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.envs import ReturnToGoWrapper
+from tests.recorded import minari_folder, workplace  # noqa: F401  (fixtures of the rooms that use the command line)
 
 TINY_POLICY = dict(embed_dim=32, n_layers=2, n_heads=2)
 TINY_FLOW_POLICY = dict(TINY_POLICY, flow_hidden_dim=32, flow_n_layers=2, n_solver_steps=4)

@@ -402,6 +402,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         batch_generator, noise_generator = self._training_generators(parallel)
         batches = buffer.batches(self.batch_size, self.context_length, batch_generator, self.timestep_exponent)
         callback.on_training_start(locals(), globals())
+        parallel.from_first(True)  # which may evaluate for longer than a gradient step's messages wait
         while self.num_timesteps < total_timesteps:
             step_start = time.perf_counter()
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)

@@ -5,7 +5,6 @@ from typing import Any
 import pytest
 
 from sb3_dtfm.benchmark.rows import Row
-from tests.recorded import minari_folder, workplace
 
 
 def make_row(**changes: Any) -> Row:
@@ -45,6 +44,3 @@ def make_row(**changes: Any) -> Row:
 def row() -> Row:
     """One row."""
     return make_row()
-
-
-__all__ = ["make_row", "minari_folder", "row", "workplace"]

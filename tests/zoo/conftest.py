@@ -1,3 +1,0 @@
-from tests.recorded import minari_folder, workplace
-
-__all__ = ["minari_folder", "workplace"]
