@@ -59,7 +59,7 @@ def load_robomimic(
     success, or the last step if nothing is marked as done. Other rewards (dense ones) are kept as they are.
 
     The `object` observation of robosuite <= 1.4 is brought into the present form, which the environment shows too: Lift's
-    gripper-to-cube vector had the opposite sign, and Can's two poses the opposite order.
+    gripper-to-cube vector had the opposite sign, and the two poses of Can, Square and the like the opposite order.
 
     :param path: the file
     :param filter_key: read only the demonstrations listed in `mask/<filter_key>`, such as "train"
@@ -240,10 +240,13 @@ def _present_object_state(observations: np.ndarray, keys: tuple[str, ...], env_a
     if keys != DEFAULT_OBSERVATION_KEYS or not version or version >= [1, 5]:
         return observations
     hand, quaternion, state = observations[:, :3], observations[:, 3:7], observations[:, 9:]
-    task = (env_args.get("env_name"), state.shape[1])
-    if task == ("Lift", 10) and np.allclose(state[:, 7:], hand - state[:, :3], atol=OLD_LAYOUT_TOLERANCE):
+    if (
+        env_args.get("env_name") == "Lift"
+        and state.shape[1] == 10
+        and np.allclose(state[:, 7:], hand - state[:, :3], atol=OLD_LAYOUT_TOLERANCE)
+    ):
         return np.concatenate([observations[:, :16], -observations[:, 16:]], axis=1)
-    if task == ("PickPlaceCan", 14):
+    if state.shape[1] == 14:  # one object's two poses: Can, Milk, Bread, Cereal, Square, Round
         in_hand = _in_frame(state[:, :3] - hand, quaternion)
         if np.allclose(state[:, 7:10], in_hand, atol=OLD_LAYOUT_TOLERANCE):
             return np.concatenate([observations[:, :9], state[:, 7:], state[:, :7]], axis=1)

@@ -165,14 +165,14 @@ class FlowHead(ActionHead):
         hidden = hidden.detach()
         with th.no_grad():
             target = self.solve(hidden, noise, "euler", DISTILLED_STEPS).clamp(-1.0, 1.0)
-        return masked_mean((self.jump(hidden, noise) - target).square(), mask)
+        return masked_mean((self.one_step_action(hidden, noise) - target).square(), mask)
 
     def forward(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
         if self.solver == ONE_STEP:
-            return self.jump(hidden, noise)
+            return self.one_step_action(hidden, noise)
         return self.solve(hidden, noise, self.solver, self.n_solver_steps)
 
-    def jump(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
+    def one_step_action(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
         """From noise (..., A) to actions (..., A) in one step."""
         assert self.one_step is not None
         return noise + self.one_step(noise, self.one_step.film_condition(hidden))

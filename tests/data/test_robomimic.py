@@ -172,16 +172,17 @@ def test_old_lift_files_get_the_present_sign(path):
     np.testing.assert_array_equal(kept, stacked(demo))
 
 
-def test_old_can_files_get_the_present_order(path):
+@pytest.mark.parametrize("task", ["PickPlaceCan", "PickPlaceMilk", "NutAssemblySquare"])
+def test_old_files_of_one_object_get_the_present_order(task, path):
     demo = make_demo(5, success_at=4, object_width=14)
     observations, state = demo["obs"], demo["obs"]["object"]
     quarter_turn = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])  # the hand's x axis is the world's y axis
     observations["robot0_eef_quat"][:] = quarter_turn
     away = state[:, :3] - observations["robot0_eef_pos"]
     state[:, 7:10] = np.stack([away[:, 1], -away[:, 0], away[:, 2]], axis=1)
-    read = load_robomimic(write(path, {"demo_0": demo}, env_args("PickPlaceCan", "1.4.1"))).observations
+    read = load_robomimic(write(path, {"demo_0": demo}, env_args(task, "1.4.1"))).observations
     np.testing.assert_array_equal(read[:, 9:], np.concatenate([state[:, 7:], state[:, :7]], axis=1).astype(np.float32))
-    kept = load_robomimic(write(path, {"demo_0": demo}, env_args("PickPlaceCan", "1.5.1"))).observations
+    kept = load_robomimic(write(path, {"demo_0": demo}, env_args(task, "1.5.1"))).observations
     np.testing.assert_array_equal(kept, stacked(demo))
 
 

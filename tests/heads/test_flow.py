@@ -101,7 +101,7 @@ def test_a_flow_head_learns_two_modes_that_regression_would_average(prediction):
         samples = head.solve(th.zeros(500, 4), th.randn(500, 1, generator=generator), "euler", 20)
         noise = th.randn(500, 1, generator=generator)
         ends, plain = (head.solve(th.zeros(500, 4), noise, "euler", n_steps) for n_steps in (16, 1))
-        jumps = head.jump(th.zeros(500, 4), noise)
+        jumps = head.one_step_action(th.zeros(500, 4), noise)
     assert ((samples.abs() - 0.7).abs() < 0.2).float().mean() > 0.9
     assert 0.35 < (samples > 0).float().mean() < 0.65
     far = noise.abs() > 0.3  # between the modes the flow is steep
