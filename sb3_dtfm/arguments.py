@@ -75,11 +75,11 @@ def check_arguments(given: Mapping[str, Any], accepted: Mapping[str, Rule]) -> d
     """
     :param given: values by name; others than `accepted` are left alone
     :param accepted: what each name may be
-    :return: the accepted ones, NumPy's numbers as Python's, which every file format can hold
+    :return: the accepted ones, NumPy's scalars as Python's, which every file format can hold
     :raises ValueError: names the argument, what was given and what is accepted
     """
+    values = {name: given[name].item() if isinstance(given[name], np.generic) else given[name] for name in accepted}
     for name, rule in accepted.items():
-        if not rule.accepts(given[name]):
+        if not rule.accepts(values[name]):
             raise ValueError(f"{name} must be {rule}, got {given[name]!r}.")
-    values = {name: given[name] for name in accepted}
-    return {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
+    return values

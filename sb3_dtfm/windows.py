@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-OBSERVATION_KEYS = ("observation", "return_to_go", "timestep")
+# What an observation holds beside the numbers of the environment.
+COLUMNS = {"return_to_go": np.float32, "timestep": np.int64}
+OBSERVATION_KEYS = ("observation", *COLUMNS)
 
 
 class Windows(NamedTuple):
@@ -130,7 +132,7 @@ def unpack_observation(observation: Any, observation_dim: int) -> tuple[tuple[np
     :param observation: Dict of `observation` (O,), `return_to_go` (1,), `timestep` (1,), or with a leading axis B
     :param observation_dim: O
     :return: observation (B, O) and return-to-go (B,) as float32, time step (B,) as int64; and whether B was there
-    :raises ValueError: not such a Dict, or another O
+    :raises ValueError: not such a Dict, another O, or not one return-to-go and time step for each observation
     """
     if not isinstance(observation, dict) or not set(OBSERVATION_KEYS) <= set(observation):
         found = f"the keys {sorted(observation)}" if isinstance(observation, dict) else type(observation).__name__
@@ -146,6 +148,8 @@ def unpack_observation(observation: Any, observation_dim: int) -> tuple[tuple[np
         )
     vectorized = values.ndim == 2
     values = values.reshape(-1, observation_dim)
-    return_to_go = np.asarray(observation["return_to_go"], dtype=np.float32).reshape(len(values))
-    timestep = np.asarray(observation["timestep"], dtype=np.int64).reshape(len(values))
-    return (values, return_to_go, timestep), vectorized
+    return_to_go, timestep = (np.asarray(observation[name], kind) for name, kind in COLUMNS.items())
+    for name, column in zip(COLUMNS, (return_to_go, timestep), strict=True):
+        if column.size != len(values):
+            raise ValueError(f"observation[{name!r}] has shape {column.shape}; ({len(values)}, 1) is expected.")
+    return (values, return_to_go.reshape(-1), timestep.reshape(-1)), vectorized

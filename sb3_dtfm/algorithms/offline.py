@@ -165,8 +165,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         self._means = RunningMeans()
         self._training_seconds = 0.0
         if _init_setup_model:
-            self._check_arguments()
-            self._check_learning_rate()
+            self._check_arguments(learning_rate=POSITIVE)
             buffer = self._load_buffer()
             self.max_timestep = int(buffer.episode_lengths.max())
             self.score_reference = buffer.score_reference
@@ -176,15 +175,13 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
             if normalization.return_to_go_range is not None:
                 normalization.set_return_to_go_range(buffer.return_to_go_range())
 
-    def _check_arguments(self) -> None:
-        vars(self).update(check_arguments(vars(self), ACCEPTED))
+    def _check_arguments(self, learning_rate: Rule) -> None:
+        """
+        :param learning_rate: what a number may be that is given as such: 0 is for those who load a model to act with it
+        """
+        accepted = ACCEPTED if callable(self.learning_rate) else {**ACCEPTED, "learning_rate": learning_rate}
+        vars(self).update(check_arguments(vars(self), accepted))
         check_batch_size(self.batch_size)
-
-    def _check_learning_rate(self) -> None:
-        """Apart from the others: who loads a model to act with it may set 0, as RL-Zoo does."""
-        if not callable(self.learning_rate):
-            check_arguments({"learning_rate": self.learning_rate}, {"learning_rate": POSITIVE})
-            self.learning_rate = float(self.learning_rate)  # SB3 takes neither whole numbers nor NumPy's
 
     def set_dataset(self, dataset: Dataset) -> None:
         """
@@ -244,7 +241,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         )
 
     def _setup_model(self) -> None:
-        self._check_arguments()
+        self._check_arguments(learning_rate=NOT_NEGATIVE)
         if self.score_reference is not None:  # a list in a saved file
             self.score_reference = ScoreReference(*self.score_reference)
         self._setup_lr_schedule()
@@ -325,6 +322,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         :raises ValueError: an attribute out of range, or an environment that does not fit
         """
         model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
+        model.policy.set_weight_decay(model.weight_decay)  # the optimiser's state in the file brings that of its own
         if env is not None:
             model.set_env(env, force_reset)
         return model
@@ -356,7 +354,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
         """SB3's set-up without the environment's first reset, which offline learning does not need."""
-        self._check_learning_rate()
+        self._check_arguments(learning_rate=POSITIVE)
         self.start_time = time.time_ns()
         if reset_num_timesteps:
             self.num_timesteps = 0
@@ -391,7 +389,7 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         :param reset_num_timesteps: count from zero, otherwise go on counting
         :param progress_bar: show one
         :return: the model
-        :raises ValueError: no dataset
+        :raises ValueError: no dataset, or an argument out of range
         :raises FloatingPointError: the loss or its gradient is no longer finite; the weights are those from before
         """
         buffer = self.buffer or self._load_buffer()

@@ -3,6 +3,7 @@
 import copy
 import inspect
 import json
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -107,7 +108,7 @@ class SequencePolicy(BasePolicy):
         self._constructor_arguments = {**arguments, **self.head_class.options(), **head_options}
         self.context_length = context_length
         self.weight_decay = arguments["weight_decay"]
-        self.kv_cache = kv_cache
+        self.kv_cache = arguments["kv_cache"]
         self.seed = seed
         self.observation_dim = int(observation_space["observation"].shape[0])  # type: ignore[index]
         self.action_dim = int(action_space.shape[0])
@@ -146,6 +147,28 @@ class SequencePolicy(BasePolicy):
         others = [parameter for parameter in self.network.parameters() if id(parameter) not in decayed]
         groups = [{"params": matrices, "weight_decay": self.weight_decay}, {"params": others, "weight_decay": 0.0}]
         return self.optimizer_class(groups, lr=learning_rate, fused=True)  # type: ignore[call-arg]
+
+    def set_weight_decay(self, weight_decay: float) -> None:
+        """
+        :param weight_decay: of weight matrices from the next gradient step on
+        """
+        self.optimizer.param_groups[0]["weight_decay"] = self.weight_decay = weight_decay
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
+        """
+        torch's, for a policy with or without a moving average whatever was saved: one that begins starts from the weights.
+
+        :param state_dict: of a policy like this one
+        :param strict: as in torch
+        :param assign: as in torch
+        """
+        weights = {name: value for name, value in state_dict.items() if not name.startswith("ema_network.")}
+        if self.ema_network is None:
+            state_dict = weights
+        elif len(weights) == len(state_dict):
+            averaged = {f"ema_{name}": value for name, value in weights.items() if name.startswith("network.")}
+            state_dict = {**weights, **averaged}
+        return super().load_state_dict(state_dict, strict, assign)
 
     def clipped_parameters(self) -> list[nn.Parameter]:
         """The parameters whose gradient norm is logged and clipped."""
@@ -228,7 +251,7 @@ class SequencePolicy(BasePolicy):
         :param episode_start: (B,) bool, True where an environment was just reset
         :param deterministic: repeat exactly for the same model, state and inputs; otherwise draw fresh noise
         :return: actions (A,) or (B, A) in the environment's range, and the next state
-        :raises ValueError: not the observation of a `ReturnToGoWrapper`, or a state of another number of environments
+        :raises ValueError: not the observation of a `ReturnToGoWrapper`, or a state of other environments
         """
         arrays, vectorized = unpack_observation(observation, self.observation_dim)
         n_rows, timestep = len(arrays[0]), arrays[2]
@@ -238,8 +261,8 @@ class SequencePolicy(BasePolicy):
             before = self._remembered.recall(arrays[0], timestep)
         if before is None:
             before = empty_context(n_rows, self.context_length, self.observation_dim, self.action_dim)
-        if len(before.mask) != n_rows:
-            raise ValueError(f"state belongs to {len(before.mask)} environments, the observation to {n_rows}.")
+        if before.observations.shape != (expected := (n_rows, self.context_length, self.observation_dim)):
+            raise ValueError(f"state holds observations of shape {before.observations.shape}; {expected} is expected.")
         lost = restarts(before, timestep) & (timestep > 0)
         if episode_start is not None:
             lost &= ~np.asarray(episode_start, dtype=bool)

@@ -24,12 +24,18 @@ REFUSED = {
     "timestep_exponent": (0, -1.0, float("inf"), NAN),
     "precision": ("float8",),
     "learning_rate_schedule": ("step",),
+    "compile": ("yes", 1),
+    "dataset_seed": (-1, 2.5, None),
+    "seed": (-1, 2.5),
 }
 REFUSED_OF_THE_POLICY = {
     "embed_dim": (0, 2.5),
     "n_layers": (0, 2.5),
     "n_heads": (0, 2.5),
     "dropout": (1.0, -0.1, NAN),
+    "timestep_embedding": ("no", 0),
+    "clip_return_to_go": ("no", None),
+    "kv_cache": ("no", 1),
 }
 REFUSED_OF_THE_FLOW = {
     "flow_hidden_dim": (0, 2.5),
@@ -39,6 +45,7 @@ REFUSED_OF_THE_FLOW = {
     "flow_prediction": ("noise",),
     "solver": ("leapfrog",),
     "regression_coef": (-1, NAN),
+    "one_step": ("no", 0),
 }
 # Where a value is one of a few words, the refusal lists them.
 CHOICES = {
@@ -76,13 +83,30 @@ def test_an_argument_out_of_range_is_refused(name, value, algorithm, cheetah_buf
     check_refusal(str(refusal.value), name, value)
 
 
-@pytest.mark.parametrize(("name", "value"), pairs(REFUSED))
+@pytest.mark.parametrize(("name", "value"), [pair for pair in pairs(REFUSED) if pair.values != ("learning_rate", 0)])
 def test_an_argument_out_of_range_is_refused_at_load(name, value, cheetah_buffer, saved):
     """Also without data, since a model that cannot learn later should say so at once."""
     for kwargs in ({"dataset": cheetah_buffer}, {}):
         with pytest.raises(ValueError, match=name) as refusal:
             DT.load(saved / "DT", **{name: value}, **kwargs)
         check_refusal(str(refusal.value), name, value)
+
+
+def test_who_only_acts_may_load_a_learning_rate_of_0(cheetah_buffer, saved):
+    """As RL-Zoo's enjoy does; nothing can be learned with it."""
+    loaded = DT.load(saved / "DT", learning_rate=0, dataset=cheetah_buffer)
+    assert np.isfinite(first_action(loaded)).all()
+    with pytest.raises(ValueError, match="learning_rate") as refusal:
+        loaded.learn(1)
+    check_refusal(str(refusal.value), "learning_rate", 0)
+
+
+def test_an_argument_that_was_changed_by_hand_is_refused_by_learn(cheetah_buffer):
+    model = make_model(DT, cheetah_buffer)
+    model.batch_size = 0
+    with pytest.raises(ValueError, match="batch_size") as refusal:
+        model.learn(1)
+    check_refusal(str(refusal.value), "batch_size", 0)
 
 
 @pytest.mark.parametrize(("name", "value"), pairs(REFUSED_OF_THE_POLICY))
@@ -117,7 +141,10 @@ NUMPY = dict(
     warmup_steps=np.int64(2), max_grad_norm=np.float32(0.5), ema_decay=np.float64(0.9), timestep_exponent=np.float32(1.5),
     dataset_fraction=np.float32(0.5), dataset_seed=np.int64(1),
 )  # fmt: skip
-NUMPY_POLICY = dict(embed_dim=np.int64(16), n_layers=np.int64(1), n_heads=np.int32(2), dropout=np.float32(0.1))
+NUMPY_POLICY = dict(
+    embed_dim=np.int64(16), n_layers=np.int64(1), n_heads=np.int32(2), dropout=np.float32(0.1),
+    timestep_embedding=np.False_, kv_cache=np.True_,
+)  # fmt: skip
 NUMPY_FLOW = dict(
     flow_hidden_dim=np.int64(16), flow_n_layers=np.int64(1), flow_tau_exponent=np.float32(1.5), n_solver_steps=np.int64(3),
     regression_coef=np.float64(0.5),

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.monitor import Monitor
 
@@ -68,3 +69,27 @@ def test_a_second_learn_draws_new_noise(one_step_buffer, tmp_path):
     assert not np.isclose(first, second, rtol=1e-5).any()
     assert np.array_equal(second, learn_losses(DTFM.load(tmp_path / "model", dataset=one_step_buffer), 5))
     assert np.array_equal(first, learn_losses(make_model(DTFM, one_step_buffer, **STANDSTILL), 5))
+
+
+def test_a_weight_decay_given_to_load_decays(cheetah_buffer, tmp_path):
+    """Not the one that the optimiser's state in the file has."""
+    make_model(DT, cheetah_buffer, **{**STANDSTILL, "learning_rate": 0.1}).learn(1).save(tmp_path / "model")
+
+    def weights(decay: float, n_steps: int) -> th.Tensor:
+        model = DT.load(tmp_path / "model", dataset=cheetah_buffer, weight_decay=decay).learn(n_steps)
+        return th.cat([weight.detach().flatten() for weight in model.policy.optimizer.param_groups[0]["params"]])
+
+    assert th.allclose(weights(0.0, 1) - weights(5.0, 1), 0.1 * 5.0 * weights(0.0, 0), atol=1e-5)
+
+
+@pytest.mark.parametrize(("saved_decay", "decay"), [(0.0, 0.9), (0.9, 0.0)])
+def test_a_moving_average_can_begin_and_end_at_load(saved_decay, decay, cheetah_buffer, tmp_path):
+    """It begins from the weights; without it the weights act."""
+    model = make_model(DT, cheetah_buffer, ema_decay=saved_decay, learning_rate=0.1).learn(2)
+    model.save(tmp_path / "model")
+    loaded = DT.load(tmp_path / "model", dataset=cheetah_buffer, ema_decay=decay)
+    acting = loaded.policy.acting_network
+    assert (acting is loaded.policy.network) == (decay == 0.0)
+    for name, weight in model.policy.network.state_dict().items():
+        assert th.equal(acting.state_dict()[name], weight), name
+    assert loaded.learn(1).num_timesteps == 1

@@ -193,13 +193,16 @@ def test_an_observation_without_return_to_go_is_refused(model):
     observation, _ = make_env().reset(seed=0)
     with pytest.raises(ValueError, match=r"\(16,\).*\(17,\)"):
         model.predict({**observation, "observation": observation["observation"][:16]})
+    for name in ("return_to_go", "timestep"):
+        with pytest.raises(ValueError, match=rf"{name}.*\(2,\).*\(1, 1\)"):
+            model.predict({**observation, name: np.zeros(2)})
 
 
 def test_a_state_of_other_environments_is_refused(model):
     observation, _ = make_env().reset(seed=0)
     _, state = model.predict(observation)
     batch = {key: np.stack([value] * 3) for key, value in observation.items()}
-    with pytest.raises(ValueError, match="1 environments, the observation to 3"):
+    with pytest.raises(ValueError, match=r"\(1, 5, 17\).*\(3, 5, 17\)"):
         model.predict(batch, state=state)
 
 
