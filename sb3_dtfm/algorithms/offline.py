@@ -487,8 +487,8 @@ class OfflineSequenceAlgorithm(BaseAlgorithm):
         for name in ("loss", "grad_norm"):
             if not math.isfinite(means.get(name, 0.0)):
                 raise FloatingPointError(
-                    f"The {name} became {means[name]} at or before gradient step {self._n_updates} of this model, whose "
-                    "weights are still those from before it. Try a lower learning_rate, warmup_steps or max_grad_norm."
+                    f"The {name} became {means[name]} at or before gradient step {self._n_updates} of this model; such "
+                    "steps change no weight. Try a lower learning_rate, warmup_steps or max_grad_norm."
                 )
 
     def _log(self, means: dict[str, float], n_steps: int) -> None:

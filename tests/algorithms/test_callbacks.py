@@ -4,38 +4,22 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.callbacks import EvalCallback, EveryNTimesteps, StopTrainingOnRewardThreshold
-from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_dtfm import DT
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd
 from sb3_dtfm.data import ScoreReference
-from tests.conftest import TINY_POLICY, make_env
+from tests.algorithms.small import make_model, record_curves
+from tests.conftest import make_env
 
 SCORE = "eval/normalized_score"
-
-
-class Records(KVWriter):
-    """A log of (step, value) for each name."""
-
-    def __init__(self) -> None:
-        self.values: dict[str, list[tuple[int, float]]] = {}
-
-    def write(self, key_values, key_excluded, step=0) -> None:
-        for name, value in key_values.items():
-            self.values.setdefault(name, []).append((step, value))
 
 
 @pytest.fixture
 def model(cheetah_buffer, monkeypatch):
     """Learns from episodes on whose scale a return of -100 is 0 and one of 100 is 1."""
     monkeypatch.setattr(cheetah_buffer, "score_reference", ScoreReference(-100.0, 100.0, "test scale"))
-    return make_model(cheetah_buffer)
-
-
-def make_model(buffer) -> DT:
-    kwargs = dict(policy_kwargs=dict(TINY_POLICY, dropout=0.1), batch_size=8, context_length=5, seed=1, device="cpu")
-    return DT("MultiInputPolicy", dataset=buffer, **kwargs)
+    return make_model(DT, cheetah_buffer)
 
 
 def evaluate_every(n_steps: int, **kwargs) -> EvalCallback:
@@ -43,10 +27,9 @@ def evaluate_every(n_steps: int, **kwargs) -> EvalCallback:
 
 
 def learn(model: DT, n_steps: int, callback, **kwargs) -> dict[str, list[tuple[int, float]]]:
-    records = Records()
-    model.set_logger(Logger(None, [records]))
+    curves = record_curves(model)
     model.learn(n_steps, callback=callback, **kwargs)
-    return records.values
+    return curves.points
 
 
 def check_scores(records: dict[str, list[tuple[int, float]]]) -> list[int]:
@@ -101,7 +84,7 @@ def test_what_is_not_to_be_evaluated_is_not(model):
 
 def test_an_evaluation_before_the_first_step_changes_no_weight(cheetah_buffer):
     evaluation = evaluate_every(100, deterministic=False)
-    plain = make_model(cheetah_buffer).learn(5)
-    evaluated = make_model(cheetah_buffer).learn(5, callback=[evaluation, EvaluateAtStartAndEnd([evaluation])])
+    plain = make_model(DT, cheetah_buffer).learn(5)
+    evaluated = make_model(DT, cheetah_buffer).learn(5, callback=[evaluation, EvaluateAtStartAndEnd([evaluation])])
     for name, tensor in plain.policy.state_dict().items():
         assert th.equal(tensor, evaluated.policy.state_dict()[name]), name

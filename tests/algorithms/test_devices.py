@@ -1,4 +1,6 @@
-"""What a GPU would have to wait for, seen without one."""
+"""What a GPU would have to wait for, and for whom, seen without one."""
+
+import time
 
 import pytest
 import torch as th
@@ -6,7 +8,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from sb3_dtfm import DT, DTFM
-from tests.algorithms.small import make_model
+from sb3_dtfm.optimization import RunningMeans
+from tests.algorithms.small import make_model, record_curves
 
 
 class OperationsOnTheCpu(TorchDispatchMode):
@@ -39,3 +42,15 @@ def test_a_gradient_step_makes_nothing_on_the_cpu_for_another_device(algorithm, 
         loss.backward()
     assert loss.device.type == "meta"
     assert operations.found == []
+
+
+def test_waiting_for_a_gpu_counts_as_training_time(cheetah_buffer, monkeypatch):
+    """Its steps have only been asked for when the loop is through with them: it is at the means that they are waited for."""
+    wait, pop = 0.5, RunningMeans.pop
+    monkeypatch.setattr(RunningMeans, "pop", lambda means: time.sleep(wait) or pop(means))
+    model = make_model(DT, cheetah_buffer)
+    curves = record_curves(model)
+    model.learn(4, log_interval=2)
+    rates = [rate for _, rate in curves.points["time/steps_per_second"]]
+    assert len(rates) == 2
+    assert all(0.0 < rate < 2 / wait for rate in rates)

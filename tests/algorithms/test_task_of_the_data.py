@@ -5,6 +5,8 @@ import minari
 import numpy as np
 import pytest
 from minari.data_collector import EpisodeBuffer
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.monitor import Monitor
 
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import DatasetError, TrajectoryBuffer
@@ -75,6 +77,18 @@ def test_later_data_and_data_for_a_loaded_model_are_checked_too(make_buffer, tmp
     model.save(tmp_path / "model")
     with pytest.raises(DatasetError, match=BOTH_NAMED):
         DT.load(tmp_path / "model", env=make_walker(), dataset=make_buffer(CHEETAH)).learn(1)
+
+
+def test_an_env_that_comes_after_the_data_is_checked_too(make_buffer):
+    """Also the one of an evaluation, which becomes the model's where it has none."""
+    model = make_model(DT, make_buffer(CHEETAH))
+    with pytest.raises(DatasetError, match=BOTH_NAMED):
+        model.set_env(make_walker())
+    with pytest.raises(DatasetError, match=BOTH_NAMED):
+        model.learn(1, callback=EvalCallback(Monitor(make_walker()), eval_freq=1, verbose=0))
+    assert model.get_env() is None
+    model.set_env(make_env())
+    assert model.get_env() is not None
 
 
 @pytest.mark.filterwarnings("ignore:.*is set to None:UserWarning")  # what else Minari would like to know
