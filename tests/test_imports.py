@@ -16,7 +16,7 @@ ROOMS = {
     "heads": ("sb3_dtfm/heads", {"heads", "networks", "arguments"}),
     "envs": ("envs", {"envs"}),
     "data": ("sb3_dtfm/data", {"data", "envs", "windows"}),
-    "recording": ("sb3_dtfm/recording", {"recording", "envs", "data"}),
+    "recording": ("sb3_dtfm/recording", {"recording", "algorithms", "envs", "data"}),
     "policies": ("sb3_dtfm/policies", {"networks", "heads", "windows", "arguments", "policies"}),
     "callbacks": ("sb3_dtfm/callbacks.py", {"data"}),
     "optimization": ("sb3_dtfm/optimization.py", set()),

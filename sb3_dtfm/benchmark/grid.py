@@ -6,10 +6,12 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.provenance import describe_data
-from sb3_dtfm.benchmark.rows import Cell, finished_cells, merge_rows
-from sb3_dtfm.benchmark.settings import Task, check_same_trunk, check_task, profile_name, read_yaml, task_settings
+from sb3_dtfm.benchmark.rows import Cell, finished_cells, read_rows
+from sb3_dtfm.benchmark.settings import Task, check_same_trunk, profile_name, read_yaml, task_settings
 from sb3_dtfm.zoo.arguments import UsageError
 
 N_EVALUATIONS = 10  # of a run, unless --eval-freq says otherwise
@@ -42,7 +44,8 @@ def read_tasks(options: argparse.Namespace) -> list[Task]:
     The tasks of the grid with their data.
 
     :param options: `tasks`, `dataset`, `datasets` and `target_return` count
-    :raises UsageError: a malformed option, an unknown task, or none at all
+    :raises UsageError: a malformed option, or no task at all
+    :raises gymnasium.error.Error: an unknown task; names the nearest one
     """
     given = _read_datasets_file(Path(options.datasets)) if options.datasets else {}
     for text in options.dataset:
@@ -59,7 +62,7 @@ def read_tasks(options: argparse.Namespace) -> list[Task]:
             if each in tasks:
                 tasks[each] = tasks[each]._replace(target_return=_number(value, f"--target-return {text}"))
     for name in tasks:
-        check_task(name)
+        gym.spec(name)
     return list(tasks.values())
 
 
@@ -92,9 +95,10 @@ def plan(options: argparse.Namespace) -> tuple[list[Job], list[Cell]]:
 
     :param options: arguments of `sb3-dtfm benchmark`
     :raises UsageError: settings that do not fit, or a finished cell of another length
-    :raises DatasetError: a dataset that cannot be read
+    :raises DatasetError: a dataset that cannot be read, or of another task
     """
-    finished = finished_cells(merge_rows(sorted(Path(options.results).glob("*.jsonl"))))
+    files = sorted(Path(options.results).rglob("*.jsonl"))  # in studies, too
+    finished = finished_cells(row for file in files for row in read_rows(file))
     profile = profile_name(options.profile)
     data: dict[str, dict[str, Any]] = {}
     jobs: list[Job] = []
@@ -114,7 +118,7 @@ def plan(options: argparse.Namespace) -> tuple[list[Job], list[Cell]]:
                 continue
             if task.env_id not in data:
                 kwargs = wanted.get("dataset_kwargs") or {}
-                data[task.env_id] = describe_data(wanted["dataset"], kwargs, task.recorded_from)
+                data[task.env_id] = describe_data(task.env_id, wanted["dataset"], kwargs, task.recorded_from)
             eval_freq = options.eval_freq or max(1, int(wanted["n_timesteps"]) // N_EVALUATIONS)
             jobs.append(Job(cell, wanted, data[task.env_id], eval_freq))
     return jobs, done

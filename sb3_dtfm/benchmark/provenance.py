@@ -14,9 +14,10 @@ import h5py
 import minari
 import numpy as np
 import torch as th
+from gymnasium.envs.registration import parse_env_id
 
 import sb3_dtfm
-from sb3_dtfm.data import load_dataset
+from sb3_dtfm.data import DatasetError, load_dataset
 
 PACKAGES = ("sb3-dtfm", "torch", "stable-baselines3", "rl_zoo3", "gymnasium", "mujoco", "robosuite", "numpy")
 GIT_TIMEOUT = 20  # seconds
@@ -71,17 +72,25 @@ def _cpu_name() -> str:
     return found[1] if found else platform.processor() or platform.machine()
 
 
-def describe_data(dataset: str, dataset_kwargs: dict[str, Any], recorded_from: str | None = None) -> dict[str, Any]:
+def describe_data(
+    env_id: str, dataset: str, dataset_kwargs: dict[str, Any], recorded_from: str | None = None
+) -> dict[str, Any]:
     """
     What a dataset was recorded from, and how good that was: the scale of normalised scores.
 
+    :param env_id: of the task
     :param dataset: Minari id or robomimic file
     :param dataset_kwargs: of :func:`~sb3_dtfm.data.load_dataset`
     :param recorded_from: the agent or demonstrator, read from the dataset's metadata if not given
     :return: dataset (a file without its folder), recorded_from, n_episodes, n_steps, and mean_return of the episodes
-    :raises DatasetError: it cannot be read
+    :raises DatasetError: it cannot be read, or was recorded on another task; versions may differ
     """
     buffer = load_dataset(dataset, **dataset_kwargs)
+    if buffer.env_id is not None and parse_env_id(buffer.env_id)[:2] != parse_env_id(env_id)[:2]:
+        raise DatasetError(
+            f"{buffer.source} was recorded in {buffer.env_id}, and the task is {env_id}. If the data are meant for it, say "
+            f"so with --label and -params \"dataset_kwargs:{{'env_id': {env_id!r}}}\"."
+        )
     in_file = Path(dataset).expanduser().is_file()
     return {
         "dataset": Path(dataset).name if in_file else dataset,

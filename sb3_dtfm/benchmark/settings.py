@@ -1,13 +1,11 @@
 """Settings of a profile for one cell: what RL-Zoo's `train` reads from its YAML file."""
 
 import copy
-import difflib
 import inspect
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import yaml
 
 from sb3_dtfm.algorithms import ALGORITHMS
@@ -36,15 +34,6 @@ class Task(NamedTuple):
     dataset: str | None = None
     target_return: float | None = None
     recorded_from: str | None = None
-
-
-def check_task(env_id: str) -> None:
-    """
-    :raises UsageError: no environment of that id; names the nearest one
-    """
-    if env_id not in gym.registry:
-        near = difflib.get_close_matches(env_id, gym.registry, n=1)
-        raise UsageError(f"{env_id}: no such task{f', did you mean {near[0]}?' if near else '.'}")
 
 
 def profile_name(profile: str) -> str:

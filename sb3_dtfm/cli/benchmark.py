@@ -7,7 +7,7 @@ from typing import Any
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.grid import N_EVALUATIONS, plan
 from sb3_dtfm.benchmark.runner import run_grid
-from sb3_dtfm.zoo.arguments import UsageError
+from sb3_dtfm.zoo.arguments import UsageError, key_values
 
 EXAMPLES = """\
 examples:
@@ -83,29 +83,13 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
         setattr(options, name, list(dict.fromkeys(getattr(options, name))))
     if options.hyperparams and not options.label:
         raise UsageError("-params: needs --label, or the rows would pass for the profile's own.")
-    options.hyperparams = _key_values("-params", options.hyperparams)
+    options.hyperparams = key_values("-params", options.hyperparams)
     if options.env_kwargs:
-        options.hyperparams["env_kwargs"] = _key_values("--env-kwargs", options.env_kwargs)
+        options.hyperparams["env_kwargs"] = key_values("--env-kwargs", options.env_kwargs)
     if options.dataset_cache is not None:
         dataset_kwargs = options.hyperparams.get("dataset_kwargs", {})
         options.hyperparams["dataset_kwargs"] = {**dataset_kwargs, "cache_dir": options.dataset_cache}
     return options
-
-
-def _key_values(option: str, texts: Sequence[str]) -> dict[str, Any]:
-    """
-    Keys with their values, which are Python as in RL-Zoo.
-
-    :raises UsageError: one cannot be evaluated
-    """
-    values = {}
-    for text in texts:
-        key, _, value = text.partition(":")
-        try:
-            values[key] = eval(value, {})
-        except Exception as error:  # whatever the user's expression raises
-            raise UsageError(f"{option} {text}: expected key:value with a value in Python ({error}).") from error
-    return values
 
 
 def main(argv: Sequence[str]) -> None:

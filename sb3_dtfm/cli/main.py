@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 from gymnasium.error import Error as GymnasiumError
 
-# What a user's mistake is raised as.
-EXPECTED_ERRORS = (ValueError, AssertionError, OSError, ImportError, GymnasiumError)
+# What a user's mistake is raised as: TypeError for an argument that somebody's constructor does not know.
+EXPECTED_ERRORS = (ValueError, TypeError, AssertionError, OSError, ImportError, GymnasiumError)
 
 # Each is `main(argv)` in a module of this package that has its name, and is imported when it is asked for.
 COMMANDS = {

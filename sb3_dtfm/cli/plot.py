@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,18 +13,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 COLORS = {"evaluation": "#1b6ca8", "loss": "#c0562b"}
-
-
-class Evaluations(NamedTuple):
-    """
-    What evaluations of n episodes each found at E gradient steps.
-
-    Shapes: steps (E,), returns (E, n) in environment reward units, successes (E, n) bool, None without such a notion.
-    """
-
-    steps: np.ndarray
-    returns: np.ndarray
-    successes: np.ndarray | None
 
 
 def main(argv: Sequence[str]) -> None:
@@ -44,32 +32,34 @@ def main(argv: Sequence[str]) -> None:
     print(f"Learning curve: {plot_learning_curve(options.run_folder, output, options.tensorboard)}")
 
 
-def load_evaluations(run_folder: Path | str) -> Evaluations:
+def load_evaluations(run_folder: Path | str) -> dict[str, np.ndarray]:
     """
-    Read `evaluations.npz` of a run folder.
+    The arrays of a run's `evaluations.npz`, of E evaluations of n episodes each.
 
+    :return: `timesteps` (E,), `results` (E, n) in environment reward units, and where the task has them `successes` (E, n)
     :raises FileNotFoundError: the run was not evaluated while it trained
     """
     path = Path(run_folder) / "evaluations.npz"
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist; expected the folder of a run with evaluations (train --eval-freq).")
     with np.load(path) as arrays:
-        return Evaluations(arrays["timesteps"], arrays["results"], arrays.get("successes"))
+        return dict(arrays)
 
 
-def load_scalar(tensorboard_folder: Path | str, tag: str) -> tuple[np.ndarray, np.ndarray]:
+def load_loss(tensorboard_folder: Path | str) -> tuple[np.ndarray, np.ndarray]:
     """
-    One curve of a TensorBoard log.
+    The training loss in a TensorBoard log.
 
     :param tensorboard_folder: folder of the event files of one run
-    :param tag: name of the curve
-    :return: steps (N,) and values (N,), both empty if there is no such curve
+    :return: steps (N,) and values (N,), both empty if no loss was logged
+    :raises FileNotFoundError: no event file in it
     """
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    accumulator = EventAccumulator(str(tensorboard_folder), size_guidance={"scalars": 0})
-    accumulator.Reload()
-    events = accumulator.Scalars(tag) if tag in accumulator.Tags()["scalars"] else []
+    if not list(Path(tensorboard_folder).glob("*tfevents*")):
+        raise FileNotFoundError(f"{tensorboard_folder} holds no TensorBoard events; expected the folder of one run's log.")
+    accumulator = EventAccumulator(str(tensorboard_folder), size_guidance={"scalars": 0}).Reload()
+    events = accumulator.Scalars("train/loss") if "train/loss" in accumulator.Tags()["scalars"] else []
     return np.array([event.step for event in events]), np.array([event.value for event in events])
 
 
@@ -90,14 +80,15 @@ def plot_learning_curve(
     from matplotlib.ticker import MaxNLocator
 
     evaluations = load_evaluations(run_folder)
-    steps, loss = load_scalar(tensorboard_folder, "train/loss") if tensorboard_folder else (np.array([]), np.array([]))
+    steps, loss = load_loss(tensorboard_folder) if tensorboard_folder else (np.array([]), np.array([]))
     with mpl.rc_context({"font.size": 11, "axes.spines.top": False, "axes.spines.right": False, "axes.axisbelow": True}):
         n_panels = 2 if len(loss) else 1
         figure = Figure(figsize=(5.2 * n_panels, 3.9), layout="constrained")
         axes = figure.subplots(1, n_panels, squeeze=False)[0]
         _draw_evaluations(axes[0], evaluations)
         if len(loss):
-            axes[1].plot(steps, loss, color=COLORS["loss"], linewidth=1.8)
+            marker = "o" if len(loss) == 1 else ""  # one point makes no line
+            axes[1].plot(steps, loss, color=COLORS["loss"], linewidth=1.8, marker=marker)
             axes[1].set(ylabel="train/loss", title="training", yscale="log")
             axes[1].grid(which="minor", color="0.95")
         for axis in axes:
@@ -110,11 +101,11 @@ def plot_learning_curve(
     return Path(output)
 
 
-def _draw_evaluations(axis: "Axes", evaluations: Evaluations) -> None:
+def _draw_evaluations(axis: "Axes", evaluations: dict[str, np.ndarray]) -> None:
     """Mean over episodes, with a band that the legend explains."""
-    steps, returns, successes = evaluations
-    if successes is not None:
-        intervals = 100 * np.array([wilson(int(row.sum()), len(row)) for row in successes])
+    steps, returns = evaluations["timesteps"], evaluations["results"]
+    if "successes" in evaluations:
+        intervals = 100 * np.array([wilson(int(row.sum()), len(row)) for row in evaluations["successes"]])
         means, low, high = intervals.T
         band = "95 % Wilson interval"
         axis.set(ylabel="success rate (%)", ylim=(0, 100))

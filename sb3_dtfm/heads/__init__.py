@@ -25,6 +25,6 @@ def _named_below(base: type[ActionHead]) -> Iterator[type[ActionHead]]:
 
 
 # By the name of the algorithm that a head makes of the trunk.
-HEADS: dict[str, type[ActionHead]] = {head.algorithm: head for head in _named_below(ActionHead)}
+HEADS: dict[str, type[ActionHead]] = {head.algorithm: head for head in _named_below(ActionHead)}  # type: ignore[type-abstract]
 
 __all__ = ["HEADS", "ActionHead", "FlowHead", "RegressionHead"]

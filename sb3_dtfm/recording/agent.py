@@ -84,7 +84,7 @@ def record_agent(
     :raises ValueError: unknown algorithm, numbers out of range, an agent of another algorithm or that does not fit the
         environment, or one that needs VecNormalize without its statistics
     """
-    check_recording(n_episodes, noise)
+    check_recording(n_episodes, noise, seed)
     if n_envs < 1:
         raise ValueError(f"n_envs must be at least 1, got {n_envs}.")
     check_dataset_id(dataset_id, overwrite)

@@ -86,12 +86,13 @@ def record_demonstrations(
     :param pause: steps that the hand rests before it closes, on average and after a first one; geometrically distributed,
         and 0 closes at once
     :raises FileExistsError: `output` exists and is not to be overwritten
-    :raises RuntimeError: fewer than one attempt in 5 succeeds
-    :raises ValueError: unknown task, or numbers out of range
+    :raises ValueError: unknown task, numbers out of range, or fewer than one attempt in 5 succeeds
     """
     if task not in demonstrated_tasks():
         raise ValueError(f"task must be one of {', '.join(map(repr, demonstrated_tasks()))}, got {task!r}.")
-    check_recording(n_episodes, noise)
+    check_recording(n_episodes, noise, seed)
+    if n_workers is not None and n_workers < 1:
+        raise ValueError(f"n_workers must be at least 1, got {n_workers}.")
     if not 0.0 <= pause < np.inf:
         raise ValueError(f"pause must be a number of steps, 0 or more, got {pause}.")
     refuse_existing(Path(output), overwrite)
@@ -114,7 +115,10 @@ def record_demonstrations(
                 bar.update(episode.terminated)
                 if len(lengths) == n_episodes:
                     return
-        raise RuntimeError(f"Only {len(lengths)} of {n_attempts} demonstrations of {task} succeeded; nothing is written.")
+        raise ValueError(
+            f"Only {len(lengths)} of {n_attempts} demonstrations of {task} succeeded with noise {noise:g} and pause "
+            f"{pause:g}; nothing is written."
+        )
 
     with closing(_run(attempt, n_workers, limit)) as attempts:
         write_robomimic(output, successes(attempts), env_args, seed)

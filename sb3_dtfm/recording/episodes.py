@@ -79,8 +79,8 @@ def run_episodes(envs: Sequence[gym.Env], act: ActFunction, seeds: Sequence[int]
     """
     One episode for each seed, in their order, run side by side.
 
-    An environment that finishes takes the next episode. Once none is left it stands still, and its row of the batch is
-    ignored, so that an agent with memory sees the same rows throughout. An episode that a wrapper ends, and not the
+    An environment that finishes takes the next episode. Once none is left it stands still at a start, and its row of the
+    batch is ignored, so that an agent with memory sees the same rows throughout. An episode that a wrapper ends, and not the
     environment itself, is truncated.
 
     :param envs: environments of one kind, with an :class:`EpisodeRecorder` among their wrappers
@@ -96,19 +96,20 @@ def run_episodes(envs: Sequence[gym.Env], act: ActFunction, seeds: Sequence[int]
     n_yielded = 0
     while active.any():
         actions = act(stack_observations(observations), starts, numbers)
-        starts[:] = False
+        starts[:] = ~active
         for row in np.flatnonzero(active):
             observations[row], _, terminated, truncated, _ = envs[row].step(actions[row])
             if not (terminated or truncated):
                 continue
             finished[numbers[row]] = episode = envs[row].get_wrapper_attr("recorded")
             episode.truncated |= not episode.terminated
+            starts[row] = True
             number = next(waiting, None)
             if number is None:
                 active[row] = False
                 continue
             observations[row], _ = envs[row].reset(seed=seeds[number])
-            numbers[row], starts[row] = number, True
+            numbers[row] = number
         while n_yielded in finished:
             yield finished.pop(n_yielded)
             n_yielded += 1
@@ -137,18 +138,21 @@ def add_noise(
     return act_with_noise
 
 
-def check_recording(n_episodes: int, noise: float) -> None:
+def check_recording(n_episodes: int, noise: float, seed: int) -> None:
     """
     Refuse numbers out of range that every recording has.
 
     :param n_episodes: episodes to record
     :param noise: standard deviation of action noise, as a share of the action range
+    :param seed: of everything random
     :raises ValueError: names the argument, what was given and what is accepted
     """
     if n_episodes < 1:
         raise ValueError(f"n_episodes must be at least 1, got {n_episodes}.")
     if not 0.0 <= noise < np.inf:
         raise ValueError(f"noise must be a share of the action range, 0 or more, got {noise}.")
+    if seed < 0:
+        raise ValueError(f"seed must be 0 or more, got {seed}.")
 
 
 def stack_observations(observations: Sequence[Any]) -> Any:

@@ -1,6 +1,7 @@
 """A trained agent: its zip file or its RL-Zoo run, what its environment was in training, and whether all of that fits."""
 
 import contextlib
+import functools
 import importlib
 import inspect
 import json
@@ -18,8 +19,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-# Names RL-Zoo gives to algorithms that differ from their class names.
-CLASS_NAMES = {"ppo_lstm": "recurrentppo"}
+from sb3_dtfm.algorithms import ALGORITHMS
+
 NOT_NORMALIZED = "none"
 
 
@@ -84,30 +85,16 @@ def _read_run(model: Path, run: Path) -> AgentFiles:
     return AgentFiles(model, dict(env_kwargs), get_wrapper_class(hyperparams), statistics)
 
 
-def find_algorithm(algo: str) -> type[BaseAlgorithm]:
-    """
-    The class of an agent by its name.
-
-    :param algo: class name in any case, or RL-Zoo's name for it
-    :raises ValueError: unknown; names those that are known
-    """
-    known = _known_algorithms()
-    name = CLASS_NAMES.get(algo.lower(), algo.lower())
-    if name not in known:
-        with contextlib.suppress(ImportError):
-            known.update(importlib.import_module("rl_zoo3").ALGOS)
-    if name not in known:
-        raise ValueError(f"Unknown algorithm {algo!r}; known are {', '.join(sorted(known))}.")
-    return known[name]
-
-
-def _known_algorithms() -> dict[str, type[BaseAlgorithm]]:
-    """Stable-Baselines3's and sb3-contrib's, by the class name in lower case."""
-    known: dict[str, type[BaseAlgorithm]] = {}
+@functools.cache
+def known_algorithms() -> dict[str, type[BaseAlgorithm]]:
+    """Ours, Stable-Baselines3's and sb3-contrib's, by the class name in lower case, which is nearly always RL-Zoo's."""
+    known: dict[str, type[BaseAlgorithm]] = dict(ALGORITHMS)
     for module_name in ("stable_baselines3", "sb3_contrib"):
         with contextlib.suppress(ImportError):
             members = inspect.getmembers(importlib.import_module(module_name), inspect.isclass)
             known.update({name.lower(): cls for name, cls in members if issubclass(cls, BaseAlgorithm)})
+    if "recurrentppo" in known:
+        known["ppo_lstm"] = known["recurrentppo"]
     return known
 
 
@@ -122,7 +109,9 @@ def load_agent(algo: str, model: str | Path, device: str) -> BaseAlgorithm:
     :param device: where its network runs
     :raises ValueError: unknown algorithm, no agent, or one of another algorithm
     """
-    algorithm = find_algorithm(algo)
+    if algo.lower() not in known_algorithms():
+        raise ValueError(f"Unknown algorithm {algo!r}; known are {', '.join(sorted(known_algorithms()))}.")
+    algorithm = known_algorithms()[algo.lower()]
     _check_algorithm(algorithm, Path(model))
     leave_out = {"learning_rate": 0.0, "lr_schedule": lambda _: 0.0, "clip_range": lambda _: 0.0}
     kwargs: dict[str, Any] = {"buffer_size": 1} if issubclass(algorithm, OffPolicyAlgorithm) else {}
@@ -133,22 +122,22 @@ def _check_algorithm(asked: type[BaseAlgorithm], model: Path) -> None:
     """
     Refuse an agent of another algorithm.
 
-    The file does not name its class, but it holds the attributes by name, and the module of the policy. They are nearest
-    to those of the class that saved them, whichever version that was.
+    The file does not name its class, but it holds the attributes by name, and the policy's module and docstring. They are
+    nearest to those of the class that saved them, whichever version that was.
     """
     try:
         with zipfile.ZipFile(model) as file:
             data = json.loads(file.read("data"))
-        saved = {*data, data["policy_class"]["__module__"]}
+        saved = {*data, data["policy_class"]["__module__"], data["policy_class"].get("__doc__")}
     except (zipfile.BadZipFile, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{model} holds no Stable-Baselines3 agent: {error!r}") from error
 
     def distance(algorithm: type[BaseAlgorithm]) -> int:
         policy = next(iter(algorithm.policy_aliases))
         bare: Any = algorithm(policy, env=None, device="cpu", _init_setup_model=False)  # type: ignore[call-arg]
-        return len(saved ^ {*vars(bare), bare.policy_class.__module__})
+        return len(saved ^ {*vars(bare), bare.policy_class.__module__, bare.policy_class.__doc__})
 
-    nearest = min(_known_algorithms().values(), key=distance)
+    nearest = min(known_algorithms().values(), key=distance)
     if distance(nearest) < distance(asked):
         raise ValueError(f"{model} was saved by {nearest.__name__}, not by {asked.__name__} (--algo).")
 

@@ -3,9 +3,11 @@
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import yaml
+from rl_zoo3.utils import StoreDict
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, packaged_config
@@ -18,6 +20,25 @@ TRAIN_EXAMPLES = """\
 
 class UsageError(ValueError):
     """Arguments that do not go together; the message says which would."""
+
+
+def key_values(option: str, texts: Sequence[str]) -> dict[str, Any]:
+    """
+    Keys with their values, which RL-Zoo evaluates as Python.
+
+    :param option: for the message
+    :param texts: `key:value` each
+    :raises UsageError: one cannot be evaluated
+    """
+    values = {}
+    for text in texts:
+        parsed = argparse.Namespace()
+        try:
+            StoreDict([], "values")(argparse.ArgumentParser(), parsed, [text])
+        except Exception as error:  # whatever the user's expression raises
+            raise UsageError(f"{option} {text}: expected key:value with a value in Python ({error}).") from error
+        values.update(parsed.values)
+    return values
 
 
 def train_parser() -> argparse.ArgumentParser:
@@ -58,7 +79,8 @@ def train_arguments(argv: Sequence[str]) -> list[str]:
     :raises UsageError: a shorthand for an algorithm that knows no dataset, or one that is missing
     """
     options, rest = train_parser().parse_known_args(argv)
-    shorthands = _shorthands(options)
+    given = key_values("-params", options.hyperparams)
+    shorthands = _shorthands(options, given)
     if options.algo not in ALGORITHMS and shorthands:
         names = ", ".join(option for option, _ in shorthands)
         raise UsageError(f"{names}: for --algo {' and '.join(ALGORITHMS)} only, not for {options.algo}.")
@@ -90,18 +112,17 @@ def _check_task(conf_file: str, env_id: str, hyperparams: Sequence[str]) -> None
         raise UsageError(f"{', '.join(missing)}: needed for {env_id}, which {conf_file} does not list.")
 
 
-def _shorthands(options: argparse.Namespace) -> list[tuple[str, str]]:
+def _shorthands(options: argparse.Namespace, given: dict[str, Any]) -> list[tuple[str, str]]:
     """Pairs of an option that was given and its `key:value`, whose value RL-Zoo evaluates as Python."""
     wrapper = [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": options.target_return}}]
-    own_kwargs = [given.partition(":")[2] for given in options.hyperparams if given.startswith("dataset_kwargs:")]
-    cached = f"{{**({(own_kwargs or ['{}'])[-1]}), 'cache_dir': {options.dataset_cache!r}}}"
+    cached = {**(given.get("dataset_kwargs") or {}), "cache_dir": options.dataset_cache}
     candidates = [
-        ("--dataset", "dataset", options.dataset, repr(options.dataset)),
-        ("--dataset-fraction", "dataset_fraction", options.dataset_fraction, repr(options.dataset_fraction)),
+        ("--dataset", "dataset", options.dataset, options.dataset),
+        ("--dataset-fraction", "dataset_fraction", options.dataset_fraction, options.dataset_fraction),
         ("--dataset-cache", "dataset_kwargs", options.dataset_cache, cached),
-        ("--target-return", "env_wrapper", options.target_return, repr(wrapper)),
+        ("--target-return", "env_wrapper", options.target_return, wrapper),
     ]
-    return [(option, f"{key}:{value}") for option, key, given, value in candidates if given is not None]
+    return [(option, f"{key}:{value!r}") for option, key, wanted, value in candidates if wanted is not None]
 
 
 def enjoy_arguments(argv: Sequence[str]) -> list[str]:

@@ -157,9 +157,14 @@ def test_a_cell_that_fails_leaves_a_log_and_the_grid_goes_on(instead, says, grid
     assert f"{log.relative_to(workplace)}: {says}" in output
     assert [path.name for path in (workplace / "results").glob("*.jsonl")] == [f"{TASK}_1_dt_seed0_tiny.jsonl"]
 
+    # What was put into a study's folder meanwhile is finished, too
+    (workplace / "results" / "study").mkdir()
+    finished = workplace / "results" / f"{TASK}_1_dt_seed0_tiny.jsonl"
+    finished.rename(workplace / "results" / "study" / "rows.jsonl")
     stub("pass")
     assert main(grid) == 0
     assert "1 cells to run, 1 finished already" in capfd.readouterr().out
+    assert not finished.exists()
 
 
 def test_an_interrupted_grid_ends_its_cells_and_says_so(grid, stub, workplace, monkeypatch, capfd):
@@ -255,10 +260,14 @@ def test_algorithms_with_different_trunks_are_refused(grid, workplace):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--env", "HalfCheeta-v5"], "HalfCheeta-v5: no such task, did you mean HalfCheetah-v5?"),
+        (["--env", "HalfCheeta-v5"], "Environment `HalfCheeta` doesn't exist. Did you mean: `HalfCheetah`?"),
         ([], "no task: name some with --env"),
         (["--dataset", TASK], f"--dataset {TASK}: expected TASK=DATASET"),
         (["--dataset", f"{TASK}=nowhere.hdf5"], "nowhere.hdf5 does not exist"),
+        (
+            ["--dataset", f"Walker2d-v5={DATASET_ID}"],
+            f"was recorded in {TASK}, and the task is Walker2d-v5. If the data are meant for it, say so with",
+        ),
         (["--env", "Hopper-v5"], "--dataset, --target-return: needed for Hopper-v5"),
         (["--env", TASK, "--profile", "nowhere.yml"], "--profile nowhere.yml: nowhere.yml does not exist"),
         (["--env", TASK, "--fractions", "2"], "--fractions: must lie in (0, 1], got 2.0"),

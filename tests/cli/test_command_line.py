@@ -128,6 +128,8 @@ def test_hyperparameters_can_be_searched(workplace, capsys):
             tiny_training("dt", "--dataset", DATASET_ID, "--env", "Walker2d-v5"),
             "was recorded in HalfCheetah-v5, and the environment is Walker2d-v5",
         ),
+        (tiny_training("dt", "foo:1", "--dataset", DATASET_ID), "got an unexpected keyword argument 'foo'"),
+        (tiny_training("dt", "gamma", "--dataset", DATASET_ID), "-params gamma: expected key:value with a value in Python"),
         (tiny_training("dt", "env_wrapper:None", "--dataset", DATASET_ID), "ReturnToGoWrapper"),
         (
             tiny_training("dtfm", "policy_kwargs:dict(one_step=False,solver='one_step')", "--dataset", DATASET_ID),

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from torch.utils.tensorboard import SummaryWriter
 
 from sb3_dtfm.cli.plot import load_evaluations, plot_learning_curve
 
@@ -21,6 +22,27 @@ def figures(monkeypatch) -> list[Figure]:
     return saved
 
 
+@pytest.mark.parametrize("n_logged", [1, 2])
+def test_the_loss_is_drawn_however_often_it_was_logged(n_logged, tmp_path, figures):
+    np.savez(tmp_path / "evaluations.npz", timesteps=[0, 10], results=np.ones((2, 3)))
+    with SummaryWriter(str(tmp_path / "tb")) as writer:
+        for step in range(n_logged):
+            writer.add_scalar("train/loss", 0.5, 10 * step)
+    plot_learning_curve(tmp_path, tmp_path / "curve.png", tmp_path / "tb")
+    (line,) = figures[0].axes[1].lines
+    assert line.get_ydata().tolist() == [0.5] * n_logged
+    assert n_logged > 1 or line.get_marker() == "o", "one point makes no line"
+
+
+def test_a_folder_without_tensorboards_events_is_refused(tmp_path):
+    np.savez(tmp_path / "evaluations.npz", timesteps=[0, 10], results=np.ones((2, 3)))
+    SummaryWriter(str(tmp_path / "tb" / "DTFM_1")).close()
+    for folder in ("tb", "nowhere"):
+        with pytest.raises(FileNotFoundError, match=f"{folder} holds no TensorBoard events; expected"):
+            plot_learning_curve(tmp_path, tmp_path / "curve.png", tmp_path / folder)
+    assert not (tmp_path / "curve.png").exists()
+
+
 @pytest.mark.parametrize(
     ("successes", "band", "means", "widest"),
     [
@@ -34,7 +56,7 @@ def test_a_run_is_drawn_with_a_band_that_is_explained_and_stays_in_the_axes(
     returns = np.array([[1.0, 1, 1, 1], [1.0, 5, 1, 5], [3.0, 7, 3, 7]])
     arrays = {} if successes is None else {"successes": np.array(successes)}
     np.savez(tmp_path / "evaluations.npz", timesteps=[0, 10, 20], results=returns, ep_lengths=np.ones((3, 4)), **arrays)
-    assert (load_evaluations(tmp_path).successes is None) == (successes is None)
+    assert ("successes" in load_evaluations(tmp_path)) == (successes is not None)
     picture = plot_learning_curve(tmp_path, tmp_path / "new" / "curve.png")
     assert picture.read_bytes().startswith(b"\x89PNG")
 

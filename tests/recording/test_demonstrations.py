@@ -133,7 +133,7 @@ def test_failed_attempts_are_left_out(hurried, tmp_path):
 
 def test_failed_recording_leaves_nothing(hurried, tmp_path):
     hurried(5)
-    with pytest.raises(RuntimeError, match="Only 0 of 15 demonstrations of lift succeeded"):
+    with pytest.raises(ValueError, match="Only 0 of 15 demonstrations of lift succeeded"):
         record_demonstrations("lift", 1, tmp_path / "lift.hdf5", n_workers=1, progress=False)
     assert list(tmp_path.iterdir()) == []
 
@@ -143,6 +143,8 @@ def test_failed_recording_leaves_nothing(hurried, tmp_path):
     [
         ({"task": "door"}, "task must be one of 'lift', .*'can', got 'door'"),
         ({"n_episodes": 0}, "n_episodes must be at least 1"),
+        ({"seed": -1}, "seed must be 0 or more, got -1"),
+        ({"n_workers": -3}, "n_workers must be at least 1, got -3"),
         ({"noise": -0.1}, "noise must be a share of the action range, 0 or more, got -0.1"),
         ({"pause": float("nan")}, "pause must be a number of steps, 0 or more, got nan"),
     ],

@@ -12,14 +12,17 @@ import pytest
 import sb3_contrib
 import stable_baselines3
 import yaml
-from rl_zoo3.utils import create_test_env, get_saved_hyperparams
+from rl_zoo3.utils import create_test_env, get_saved_hyperparams, get_wrapper_class
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_dtfm import DTFM
 from sb3_dtfm.cli.main import main
 from sb3_dtfm.recording.loading import find_agent, load_agent, load_fitting_agent
+from tests.recorded import DATASET_ID as CHEETAH_DATA
+from tests.recorded import tiny_training
 
 AGENTS = Path(__file__).parents[2].parent / "shared" / "agents"
 DATASET_ID = "test/run-v0"
@@ -66,6 +69,31 @@ def copy(run: Path, folder: Path, **config: Any) -> Path:
     path = folder / "Pendulum-v1" / "config.yml"
     path.write_text(yaml.dump({**yaml.load(path.read_text(), Loader=yaml.UnsafeLoader), **config}))
     return folder
+
+
+@pytest.mark.filterwarnings("error:.*follows none that is known")  # where an environment has nothing more to do
+def test_a_run_of_ours_is_recorded_with_its_return_to_go(workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    assert main(tiny_training("dtfm", "--dataset", CHEETAH_DATA, "--conf-file", "small", "--eval-freq", "-1")) == 0
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(workplace / "datasets"))
+    run = workplace / "logs" / "dtfm" / "HalfCheetah-v5_1"
+    arguments = ["--model", str(run), "--env", "HalfCheetah-v5", "--episodes", "3", "--n-envs", "2"]
+    arguments += ["--dataset-id", DATASET_ID, "--env-kwargs", "max_episode_steps:30"]
+    assert main(["record", "--algo", "dt", *arguments]) == 2
+    assert "HalfCheetah-v5.zip was saved by DTFM, not by DT (--algo)" in capsys.readouterr().err
+    assert main(["record", "--algo", "dtfm", *arguments]) == 0
+    dataset = minari.load_dataset(DATASET_ID)
+    model = DTFM.load(run / "HalfCheetah-v5.zip", device="cpu")
+    hyperparams, _ = get_saved_hyperparams(str(run / "HalfCheetah-v5"))
+    env = get_wrapper_class(hyperparams)(gym.make("HalfCheetah-v5", max_episode_steps=30))
+    for episode in dataset:
+        assert episode.observations.shape == (31, 17)
+        (metadata,) = dataset.storage.get_episode_metadata([episode.id])
+        observation, _ = env.reset(seed=metadata["seed"])
+        state, start = None, np.ones(1, bool)
+        for recorded_action in episode.actions:
+            action, state = model.predict(observation, state, start, deterministic=True)
+            np.testing.assert_allclose(action, recorded_action, atol=1e-5)
+            observation, start = env.step(recorded_action)[0], np.zeros(1, bool)
 
 
 @pytest.mark.parametrize("named", [".", "Pendulum-v1.zip"])
