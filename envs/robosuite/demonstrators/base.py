@@ -1,7 +1,5 @@
 """What all demonstrators share: a manner, the way to the object, the grasp, and an unsteady hand."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from sb3_dtfm.envs.robosuite.demonstrators.rotations import DOWNWARD, rotation_between
@@ -22,72 +20,31 @@ FINGERS_OPEN = 0.03  # metres from the middle
 FINGERS_STILL = 4e-4  # metres per step
 
 
-@dataclass(frozen=True)
 class Manner:
     """
-    How one person would do one episode.
+    How one person would do one episode, drawn at random.
 
-    :param speed: largest action magnitude of a free movement
-    :param time_constant: of the final approach to a point, seconds
-    :param agility: largest change of an action from step to step
-    :param hover_height: above the object, metres
-    :param hover_tolerance: horizontal distance at which the descent starts, metres
-    :param hover_offset: (2,) where the hover point lies beside the object, metres
-    :param grasp_offset: (3,) of the grasp point from the object's centre, metres
-    :param grasp_height_tolerance: height above the grasp point at which the fingers close, metres
-    :param dwell: steps between fingers at rest and the lift
-    :param lift_drift: (2,) sideways share of the lift's direction
-    :param carry_height: of the object above what it has to pass over, metres
-    :param release_offset: (2,) of the place of release from the middle of the goal, metres
-    :param release_tolerance: distance from that place at which the fingers open, metres
-    :param noise: standard deviation of the unsteadiness of the hand, action units
-    :param noise_memory: its correlation from step to step
-    :param jerk_rate: how often the hand is jerked aside, per step
+    :param rng: source of randomness
+    :param speed_range: between which `speed` is drawn
     """
 
-    speed: float
-    time_constant: float
-    agility: float
-    hover_height: float
-    hover_tolerance: float
-    hover_offset: np.ndarray
-    grasp_offset: np.ndarray
-    grasp_height_tolerance: float
-    dwell: int
-    lift_drift: np.ndarray
-    carry_height: float
-    release_offset: np.ndarray
-    release_tolerance: float
-    noise: float
-    noise_memory: float
-    jerk_rate: float
-
-    @classmethod
-    def draw(cls, rng: np.random.Generator, speed_range: tuple[float, float]) -> "Manner":
-        """
-        A person at random.
-
-        :param rng: source of randomness
-        :param speed_range: between which `speed` is drawn
-        """
-        return cls(
-            speed=rng.uniform(*speed_range),
-            time_constant=rng.uniform(0.15, 0.26),
-            agility=rng.uniform(0.2, 0.4),
-            hover_height=rng.uniform(0.05, 0.09),
-            hover_tolerance=rng.uniform(0.015, 0.025),
-            hover_offset=rng.normal(0.0, 0.006, 2),
-            grasp_offset=rng.normal(0.0, (0.005, 0.005, 0.003)),
-            grasp_height_tolerance=rng.uniform(0.006, 0.01),
-            dwell=int(rng.integers(0, 3)),
-            lift_drift=rng.normal(0.0, 0.1, 2),
-            carry_height=rng.uniform(0.02, 0.06),
-            release_offset=rng.normal(0.0, 0.01, 2),
-            release_tolerance=rng.uniform(0.035, 0.055),
-            noise=rng.uniform(0.05, 0.13),
-            noise_memory=rng.uniform(0.7, 0.9),
-            jerk_rate=rng.uniform(0.0, 0.06),
-        )
+    def __init__(self, rng: np.random.Generator, speed_range: tuple[float, float]) -> None:
+        self.speed = rng.uniform(*speed_range)  # largest action magnitude of a free movement
+        self.time_constant = rng.uniform(0.15, 0.26)  # of the final approach to a point, seconds
+        self.agility = rng.uniform(0.2, 0.4)  # largest change of an action from step to step
+        self.hover_height = rng.uniform(0.05, 0.09)  # above the object, metres
+        self.hover_tolerance = rng.uniform(0.015, 0.025)  # horizontal distance at which the descent starts, metres
+        self.hover_offset = rng.normal(0.0, 0.006, 2)  # where the hover point lies beside the object, metres
+        self.grasp_offset = rng.normal(0.0, (0.005, 0.005, 0.003))  # of the grasp point from the object's centre, metres
+        self.grasp_height_tolerance = rng.uniform(0.006, 0.01)  # above the grasp point where the fingers close, metres
+        self.dwell = int(rng.integers(0, 3))  # steps between fingers at rest and the lift
+        self.lift_drift = rng.normal(0.0, 0.1, 2)  # sideways share of the lift's direction
+        self.carry_height = rng.uniform(0.02, 0.06)  # of the object above what it has to pass over, metres
+        self.release_offset = rng.normal(0.0, 0.01, 2)  # of the place of release from the middle of the goal, metres
+        self.release_tolerance = rng.uniform(0.035, 0.055)  # from that place where the fingers open, metres
+        self.noise = rng.uniform(0.05, 0.13)  # standard deviation of the unsteadiness of the hand, action units
+        self.noise_memory = rng.uniform(0.7, 0.9)  # its correlation from step to step
+        self.jerk_rate = rng.uniform(0.0, 0.06)  # how often the hand is jerked aside, per step
 
 
 class Demonstrator:
@@ -119,7 +76,7 @@ class Demonstrator:
 
     def reset(self) -> None:
         """Start another episode in another manner."""
-        self.manner = Manner.draw(self._rng, self.speed_range)
+        self.manner = Manner(self._rng, self.speed_range)
         self.stage = "hover"
         self._steps_in_stage = 0
         self._movement = np.zeros(6)
