@@ -12,7 +12,7 @@ class DT(OfflineSequenceAlgorithm):
     """
     Decision Transformer (Chen et al., 2021): the action is regressed, under a tanh, from the trunk's hidden state.
 
-    Parameters are those of :class:`OfflineSequenceAlgorithm`.
+    Parameters are those of :class:`~sb3_dtfm.algorithms.base.OfflineAlgorithm`.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": DTPolicy}

@@ -12,7 +12,7 @@ class DTFM(OfflineSequenceAlgorithm):
     """
     Decision Transformer with flow matching: the trunk's hidden state conditions a vector field from noise to action.
 
-    Parameters are those of :class:`OfflineSequenceAlgorithm`; `policy_kwargs` also takes the options of
+    Parameters are those of :class:`~sb3_dtfm.algorithms.base.OfflineAlgorithm`; `policy_kwargs` also takes the options of
     :class:`~sb3_dtfm.heads.flow.FlowHead`.
     """
 

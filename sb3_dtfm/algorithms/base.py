@@ -1,0 +1,336 @@
+"""What an offline algorithm is made of: arguments, dataset, environment, policy, and the file it is saved to."""
+
+import io
+from abc import ABC
+from collections.abc import Iterable
+from os import PathLike
+from pathlib import Path
+from typing import Any, TypeAlias, TypeVar
+
+import minari
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from gymnasium.envs.registration import parse_env_id
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_dtfm.arguments import (
+    BOOLEAN,
+    COUNT,
+    NOT_NEGATIVE,
+    POSITIVE,
+    PROBABILITY_BELOW_1,
+    Choice,
+    Number,
+    Rule,
+    check_arguments,
+)
+from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer, check_action_space, load_dataset
+from sb3_dtfm.distributed import check_batch_size, first_of_each_machine_first, is_first_process
+from sb3_dtfm.envs import check_vec_env, return_to_go_space
+from sb3_dtfm.optimization import LEARNING_RATE_SCHEDULES, PRECISIONS, RunningMeans
+from sb3_dtfm.policies import SequencePolicy
+
+SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineAlgorithm")
+Dataset: TypeAlias = str | PathLike[str] | minari.MinariDataset | TrajectoryBuffer
+
+ACCEPTED: dict[str, Rule] = {
+    "batch_size": COUNT,
+    "weight_decay": NOT_NEGATIVE,
+    "context_length": COUNT,
+    "dataset_fraction": Number(low=0, high=1, above_low=True),
+    "dataset_seed": Number(low=0, whole=True),
+    "timestep_exponent": POSITIVE,
+    "max_grad_norm": NOT_NEGATIVE._replace(optional=True),
+    "warmup_steps": Number(low=0, whole=True),
+    "learning_rate_schedule": Choice(LEARNING_RATE_SCHEDULES),
+    "ema_decay": PROBABILITY_BELOW_1,
+    "precision": Choice(PRECISIONS),
+    "compile": Choice((None, *BOOLEAN.values)),
+    "seed": Number(low=0, whole=True, optional=True),
+}
+
+
+class OfflineAlgorithm(BaseAlgorithm, ABC):
+    """
+    A model with the data it learns from: everything of an algorithm but its learn loop.
+
+    :param policy: "MultiInputPolicy" or a policy class
+    :param env: environment wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`; optional, never used for learning
+    :param dataset: Minari id or dataset, path to a robomimic hdf5 file, or a :class:`~sb3_dtfm.data.TrajectoryBuffer`
+    :param learning_rate: AdamW's, a number or a function of the progress remaining (from 1 to 0)
+    :param batch_size: windows in a gradient step, of all processes together
+    :param weight_decay: AdamW's, on weight matrices only
+    :param context_length: K, steps the policy sees
+    :param dataset_fraction: share of the episodes to learn from, randomly drawn
+    :param dataset_seed: seed of that draw alone, so that different runs learn from the same episodes
+    :param timestep_exponent: e of the time step T u^e at which windows end in an episode of T steps, for u uniform in
+        [0, 1]: above 1 an episode's start, of which there is little in long episodes, is learned from more often
+    :param dataset_kwargs: further arguments of :func:`~sb3_dtfm.data.load_dataset`: `{"cache_dir": folder}` for datasets
+        larger than memory, `{"env_id": id}` for data that were recorded under another environment's name, and the
+        reader's own, for example `{"filter_key": "train"}` for robomimic
+    :param max_grad_norm: clip the gradient's norm to this; None and 0 do not clip
+    :param warmup_steps: gradient steps over which the learning rate rises linearly from zero; 0 for none
+    :param learning_rate_schedule: factor on the learning rate: "constant", or "linear" or "cosine" down to zero
+    :param ema_decay: decay of the exponential moving average of weights that acts; 0 acts with the trained weights
+    :param precision: "float32", "bfloat16" (autocast), or "auto": bfloat16 where the hardware multiplies in it
+    :param compile: compile the loss with `torch.compile`; None does so on a GPU. It takes a minute, and a C++ compiler
+    :param policy_kwargs: arguments of the policy, for example `embed_dim`, `n_layers`, `n_heads`, `dropout`, `kv_cache`
+    :param stats_window_size: as in SB3; offline learning collects no episodes
+    :param tensorboard_log: folder of the TensorBoard log, None for no log
+    :param verbose: 0 silent, 1 prints the log
+    :param seed: seed of weights, batches and acting
+    :param device: "auto", "cpu" or "cuda"
+    :param _init_setup_model: build the network at once
+    :raises ValueError: no dataset, or an argument out of range
+    :raises DatasetError: the dataset cannot be read, or does not fit the environment
+    """
+
+    policy: SequencePolicy
+    action_space: spaces.Box
+
+    def __init__(
+        self,
+        policy: str | type[SequencePolicy],
+        env: GymEnv | str | None = None,
+        dataset: Dataset | None = None,
+        learning_rate: float | Schedule = 1e-4,
+        batch_size: int = 256,
+        weight_decay: float = 1e-3,
+        context_length: int = 20,
+        dataset_fraction: float = 1.0,
+        dataset_seed: int = 0,
+        timestep_exponent: float = 1.0,
+        dataset_kwargs: dict[str, Any] | None = None,
+        max_grad_norm: float | None = None,
+        warmup_steps: int = 0,
+        learning_rate_schedule: str = "constant",
+        ema_decay: float = 0.0,
+        precision: str = "auto",
+        compile: bool | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            support_multi_env=True,
+            seed=seed,
+            supported_action_spaces=(spaces.Box,),
+        )
+        self.dataset = dataset
+        self.batch_size = batch_size
+        self.weight_decay = weight_decay
+        self.context_length = context_length
+        self.dataset_fraction = dataset_fraction
+        self.dataset_seed = dataset_seed
+        self.timestep_exponent = timestep_exponent
+        self.dataset_kwargs = dataset_kwargs
+        self.max_grad_norm = max_grad_norm
+        self.warmup_steps = warmup_steps
+        self.learning_rate_schedule = learning_rate_schedule
+        self.ema_decay = ema_decay
+        self.precision = precision
+        self.compile = compile
+        self.max_timestep = 1000
+        self.score_reference: ScoreReference | None = None
+        self.buffer: TrajectoryBuffer | None = None
+        self._means = RunningMeans()
+        self._training_seconds = 0.0
+        if _init_setup_model:
+            self._check_arguments(learning_rate=POSITIVE)
+            buffer = self._load_buffer()
+            self.max_timestep = int(buffer.episode_lengths.max())
+            self.score_reference = buffer.score_reference
+            self._setup_model()
+            normalization = self.policy.normalization
+            normalization.set_statistics(*buffer.statistics())
+            if normalization.return_to_go_range is not None:
+                normalization.set_return_to_go_range(buffer.return_to_go_range())
+
+    def _check_arguments(self, learning_rate: Rule) -> None:
+        """
+        :param learning_rate: what a number may be that is given as such: 0 is for those who load a model to act with it
+        """
+        accepted = ACCEPTED if callable(self.learning_rate) else {**ACCEPTED, "learning_rate": learning_rate}
+        vars(self).update(check_arguments(vars(self), accepted))
+        check_batch_size(self.batch_size)
+
+    def set_dataset(self, dataset: Dataset) -> None:
+        """
+        Learn from another dataset from now on; normalisation and spaces stay those of the model.
+
+        :param dataset: as in the constructor
+        :raises DatasetError: it cannot be read, or does not fit the model
+        """
+        self.dataset = dataset
+        self._load_buffer()
+
+    def _load_buffer(self) -> TrajectoryBuffer:
+        """Read the dataset and check it against the spaces, which it defines where there is no environment."""
+        if self.dataset is None:
+            name = type(self).__name__
+            raise ValueError(
+                f"{name} has no dataset to learn from: give one to the constructor, or to a loaded model by "
+                f"{name}.load(path, dataset=...) or model.set_dataset(...)."
+            )
+        with first_of_each_machine_first():
+            buffer = load_dataset(self.dataset, **(self.dataset_kwargs or {}))
+        observation_space = return_to_go_space(buffer.observation_space)
+        if getattr(self, "observation_space", None) is None:
+            self.observation_space, self.action_space, self.n_envs = observation_space, buffer.action_space, 1
+        self._check_spaces(observation_space, buffer.action_space, f"{buffer.source} holds", "the environment's are")
+        if self.env is not None:
+            self._check_task(buffer, self.env)
+        self.buffer = buffer.random_fraction(self.dataset_fraction, self.dataset_seed).to(self.device)
+        return self.buffer
+
+    def _check_spaces(self, observation_space: spaces.Space, action_space: spaces.Box, found: str, expected: str) -> None:
+        """
+        Compare with the model's spaces what the policy depends on: sizes, and the range of actions.
+
+        :raises DatasetError: they do not fit
+        """
+        ours, theirs = self.observation_space["observation"], observation_space["observation"]  # type: ignore[index]
+        if ours.shape != theirs.shape:
+            raise DatasetError(f"{found} observations of {theirs}, {expected} {ours}.")
+        same_bounds = self.action_space.shape == action_space.shape and (
+            np.allclose(self.action_space.low, action_space.low) and np.allclose(self.action_space.high, action_space.high)
+        )
+        if not same_bounds:
+            raise DatasetError(f"{found} actions of {action_space}, {expected} {self.action_space}.")
+
+    @staticmethod
+    def _check_task(buffer: TrajectoryBuffer, env: VecEnv) -> None:
+        """
+        :raises DatasetError: the data were recorded in another environment; versions may differ
+        """
+        (spec,) = env.get_attr("spec", indices=0)
+        if spec is None or buffer.env_id is None or parse_env_id(spec.id)[:2] == parse_env_id(buffer.env_id)[:2]:
+            return
+        raise DatasetError(
+            f"{buffer.source} was recorded in {buffer.env_id}, and the environment is {spec.id}. If the data are meant for "
+            f"it, say so with dataset_kwargs={{'env_id': {spec.id!r}}}."
+        )
+
+    def _setup_model(self) -> None:
+        self._check_arguments(learning_rate=NOT_NEGATIVE)
+        if self.score_reference is not None:  # a list in a saved file
+            self.score_reference = ScoreReference(*self.score_reference)
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        self.policy = self.policy_class(  # type: ignore[assignment]
+            self.observation_space,
+            self.action_space,
+            self.lr_schedule,
+            context_length=self.context_length,
+            max_timestep=self.max_timestep,
+            weight_decay=self.weight_decay,
+            ema=self.ema_decay > 0,
+            seed=self.seed,
+            **self.policy_kwargs,
+        ).to(self.device)
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """
+        Seed everything random, the noise of `predict(deterministic=False)` included.
+
+        :param seed: None changes nothing
+        """
+        super().set_random_seed(seed)
+        if seed is not None and hasattr(self, "policy"):
+            self.policy.seed_noise(seed)
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        """
+        SB3's wrapping, then a check that return-to-go arrives unharmed and that actions can be learned.
+
+        :raises ValueError: no return-to-go in the observation, normalised or stacked observations, or unbounded actions
+        """
+        vec_env = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        check_vec_env(vec_env)
+        check_action_space(vec_env.action_space, "the environment")
+        return vec_env
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        Act in another environment from now on.
+
+        :param env: of the model's sizes and range of actions; the bounds of observations may differ, since the policy
+            normalises them itself
+        :param force_reset: as in SB3
+        :raises ValueError: it does not fit
+        """
+        vec_env = self._wrap_env(env, self.verbose)
+        action_space = check_action_space(vec_env.action_space, "the environment")
+        self._check_spaces(vec_env.observation_space, action_space, "The environment has", "the model's are")
+        if self.buffer is not None:
+            self._check_task(self.buffer, vec_env)
+        self.observation_space, self.action_space = vec_env.observation_space, action_space
+        self.n_envs = vec_env.num_envs
+        super().set_env(vec_env, force_reset)
+
+    @classmethod
+    def load(
+        cls: type[SelfAlgorithm],
+        path: str | Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfAlgorithm:
+        """
+        SB3's loading; arguments are SB3's.
+
+        :param path: file to load
+        :param env: see :meth:`set_env`
+        :param device: "auto", "cpu" or "cuda"
+        :param custom_objects: objects to use in place of those in the file
+        :param print_system_info: print what the file was saved with
+        :param force_reset: as in SB3
+        :param kwargs: attributes to change, `dataset` for example
+        :raises ValueError: an attribute out of range, or an environment that does not fit
+        """
+        model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
+        model.policy.set_weight_decay(model.weight_decay)  # the optimiser's state in the file brings that of its own
+        if env is not None:
+            model.set_env(env, force_reset)
+        return model
+
+    def save(
+        self,
+        path: str | Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        SB3's saving, on process 0 only: the others hold the same model, and would write the same file at the same time.
+
+        :param path: file to write
+        :param exclude: attributes to leave out beside the default ones
+        :param include: attributes to save although they are left out by default
+        """
+        if is_first_process():
+            super().save(path, exclude, include)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "dataset", "buffer", "_means"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "policy.optimizer"], []
