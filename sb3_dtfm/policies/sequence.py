@@ -16,6 +16,7 @@ from torch import nn
 from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, PROBABILITY_BELOW_1, Rule, check_arguments
 from sb3_dtfm.heads import ActionHead
 from sb3_dtfm.networks.trunk import TOKENS_PER_STEP, SequenceTrunk
+from sb3_dtfm.policies.kept import hand_out, take_up
 from sb3_dtfm.policies.memory import RememberedContext
 from sb3_dtfm.policies.normalization import Normalization
 from sb3_dtfm.windows import Context, Windows, empty_context, push, restarts, unpack_observation, with_action
@@ -318,10 +319,10 @@ class SequencePolicy(BasePolicy):
         for n_back in range(n_missing, -1, -1):
             earlier = Windows(*(x.roll(n_back, dims=1) for x in windows)) if n_back else windows
             earlier.mask[:, :n_back] = False  # the newest steps went round to the left
-            keys_values = th.empty(*shape[:3], shape[3] + TOKENS_PER_STEP, shape[4], device=device)
-            keys_values[..., : shape[3], :] = th.from_numpy(kept).to(device)
-            hidden = trunk.extend(**earlier._asdict(), keys_values=keys_values)
-            kept = keys_values[..., TOKENS_PER_STEP:, :].cpu().numpy()
+            memory, end = take_up(kept, TOKENS_PER_STEP, device)
+            start, end = end - shape[3], end + TOKENS_PER_STEP
+            hidden = trunk.extend(**earlier._asdict(), keys_values=memory[..., start:end, :])
+            kept = hand_out(memory, start + TOKENS_PER_STEP, end)
         return hidden, kept
 
     def _acting_noise(self, context: Context, deterministic: bool) -> th.Tensor:

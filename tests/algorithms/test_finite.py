@@ -5,6 +5,7 @@ import torch as th
 from stable_baselines3.common.callbacks import CheckpointCallback
 
 from sb3_dtfm import DT, DTFM
+from sb3_dtfm.optimization import RunningMeans
 from tests.algorithms.small import make_model
 
 # Steps so long that the next loss, or its gradient, leaves the range of float32.
@@ -44,3 +45,10 @@ def test_a_model_that_diverged_can_go_on_more_slowly(cheetah_buffer, tmp_path):
         diverging.learn(20, log_interval=None)
     states = diverging.policy.optimizer.state_dict()["state"].values()
     assert all(th.isfinite(values).all() for state in states for values in state.values())
+
+
+def test_the_end_of_learning_looks_once_more(cheetah_buffer, monkeypatch):
+    """Where a GPU computes the loss, nobody has looked at it before if nothing was logged."""
+    monkeypatch.setattr(RunningMeans, "pop", lambda means: {"loss": float("nan"), "grad_norm": 1.0})
+    with pytest.raises(FloatingPointError, match="loss became nan"):
+        make_model(DT, cheetah_buffer).learn(1, log_interval=None)

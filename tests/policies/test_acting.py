@@ -1,5 +1,7 @@
 """`predict`: full context in every way of calling it, repeatable, and safe against the wrong input."""
 
+import itertools
+
 import numpy as np
 import pytest
 import torch as th
@@ -251,6 +253,24 @@ def test_a_cache_that_starts_in_mid_episode_is_filled_from_the_window(model):
     for state in states:
         actions.append(model.predict(observations, state=state, episode_start=np.zeros(2, bool), deterministic=True)[0])
     assert np.allclose(*actions, atol=1e-4)
+
+
+def test_what_is_kept_is_not_copied_at_every_step(model):
+    """Whoever goes on from the newest state appends to what it keeps; an older state is copied first, and stays."""
+    model.policy.set_acting(kv_cache=True)
+    observation, _ = make_env().reset(seed=0)
+    kept = []
+    state = None
+    for t in range(50):
+        _, state = model.predict({**observation, "timestep": np.array([t])}, state, np.array([t == 0]), deterministic=True)
+        kept.append(state[-1])
+    shared = [np.shares_memory(before, after) for before, after in itertools.pairwise(kept)]
+    assert sum(shared) > 40
+    assert not all(shared)  # at some step there is no more room
+    _, other = model.predict({**observation, "timestep": np.array([50])}, state, deterministic=True)
+    _, again = model.predict({**observation, "timestep": np.array([50])}, state, deterministic=True)
+    assert not np.shares_memory(other[-1], again[-1])
+    assert np.array_equal(other[-1], again[-1])
 
 
 def test_predict_with_a_cache_is_a_pure_function(model):

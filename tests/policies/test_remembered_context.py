@@ -165,3 +165,13 @@ def test_reset_forgets(model, episodes):
     forgotten = act(model, observations[4])
     assert np.array_equal(forgotten, act_alone(model, observations[4:5])[0])
     assert not np.array_equal(forgotten, act_alone(model, observations[:5])[4])
+
+
+def test_of_parallel_environments_one_may_be_asked_again_while_another_goes_on(model, episodes, hints):
+    ours, theirs = episodes[:2]
+    order = [(0, 0), (1, 1), (1, 2), (2, 3), (3, 3), (4, 4)]
+    expected = [act_alone(model, episode[:5]) for episode in (ours, theirs)]
+    for i, j in order:
+        pair = {key: np.stack([ours[i][key], theirs[j][key]]) for key in ours[i]}
+        assert np.allclose(act(model, pair), [expected[0][i], expected[1][j]], atol=1e-4), (i, j)
+    assert hints() == []

@@ -47,3 +47,27 @@ def test_threads_with_their_own_states_act_as_alone_to_the_bit(algorithm, policy
         for _ in range(2):
             together = pool.map(lambda observations: roll(model, observations, barrier), episodes)
             assert np.array_equal(list(together), expected)
+
+
+def test_threads_that_go_on_from_one_state_act_as_alone_to_the_bit(cheetah_buffer, frequent_switches):
+    """One of them appends behind what the state keeps, and the others must not."""
+    model = DT("MultiInputPolicy", dataset=cheetah_buffer, context_length=5, policy_kwargs=dict(TINY_POLICY, kv_cache=True))
+    episodes = [episode.observations for episode in record_random_episodes(N_THREADS, seed=100)]
+    start = dict(observation=episodes[0][0], return_to_go=np.zeros(1), timestep=np.array([0]))
+    _, state = model.predict(start, None, np.array([True]), deterministic=True)
+    _, state = model.predict(dict(start, timestep=np.array([1])), state, deterministic=True)
+    barrier = Barrier(N_THREADS)
+
+    def go_on(observations: np.ndarray, wait: bool = True) -> np.ndarray:
+        actions, own_state = [], state
+        if wait:
+            barrier.wait()
+        for t, values in enumerate(observations[2:], start=2):
+            observation = dict(observation=values, return_to_go=np.zeros(1), timestep=np.array([t]))
+            action, own_state = model.predict(observation, own_state, deterministic=True)
+            actions.append(action)
+        return np.array(actions)
+
+    with ThreadPoolExecutor(N_THREADS) as pool:
+        together = list(pool.map(go_on, episodes))
+    assert np.array_equal(together, [go_on(observations, wait=False) for observations in episodes])
