@@ -12,15 +12,13 @@ from collections import defaultdict
 from itertools import product
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.vec_env import DummyVecEnv
 from tqdm import tqdm
 
 from sb3_dtfm import DTFM
-from sb3_dtfm.benchmark.evaluation import SeededEpisodes, evaluate
+from sb3_dtfm.benchmark.evaluation import evaluate, make_seeded_envs
 from sb3_dtfm.benchmark.report.statistics import wilson
-from sb3_dtfm.envs import ReturnToGoWrapper
+from sb3_dtfm.benchmark.settings import WRAPPER
 
 # Name: solver, its steps, keys and values kept.
 WAYS = {
@@ -35,14 +33,10 @@ WAYS = {
 }
 
 
-def make_env(env_id: str, target_return: float) -> gym.Env:
-    """An environment whose episodes start from seeds that are set."""
-    return SeededEpisodes(ReturnToGoWrapper(gym.make(env_id), target_return))
-
-
 def evaluate_ways(options: argparse.Namespace) -> None:
     """One line of JSON for each way of acting, on the same initial states."""
-    vec_env = DummyVecEnv([lambda: make_env(options.env, options.target_return)] * options.n_envs)
+    settings = {"env_wrapper": [{WRAPPER: {"target_return": options.target_return}}]}
+    vec_env = make_seeded_envs(options.env, settings, options.n_envs)
     model = DTFM.load(options.model, device="cpu")
     seeds = range(options.seed, options.seed + options.episodes)
     noise = model.policy.noise_table.clone()

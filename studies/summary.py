@@ -59,7 +59,7 @@ def lines(folder: Path) -> Iterable[dict[str, str]]:
                 "seeds": ", ".join(str(run.cell.seed) for run in runs),
                 **{name: NONE if set(each) == {NONE} else "; ".join(each) for name, each in values.items()},
                 "minutes": f"{np.mean([run.minutes for run in runs]):.1f}",
-                "commits": ", ".join(dict.fromkeys(run.final["commit"][:7] for run in runs)),
+                "commits": ", ".join(dict.fromkeys(run.commit for run in runs)),
             }
 
 

@@ -29,7 +29,7 @@ def env_id_from_robomimic(env_args: str | dict[str, Any]) -> str | None:
     :param env_args: the `env_args` attribute of the file's `data` group
     :return: such as "robosuite/Lift-v0"; None for a task that is not one of ours
     """
-    task = _task(_parsed(env_args))
+    task, _ = _parsed(env_args)
     return None if task is None else _env_id(task)
 
 
@@ -41,9 +41,8 @@ def env_kwargs_from_robomimic(env_args: str | dict[str, Any]) -> dict[str, Any]:
     :return: `task`, `controller_config` and `lite_physics`
     :raises ValueError: a task, robot or control frequency other than this module's
     """
-    arguments = _parsed(env_args)
+    task, arguments = _parsed(env_args)
     kwargs = arguments.get("env_kwargs", {})
-    task = _task(arguments)
     if task is None:
         supported = ", ".join(repr(row.environment) for row in TASKS.values())
         raise ValueError(f"env_name is {arguments.get('env_name')!r}; supported are {supported}.")
@@ -59,16 +58,11 @@ def env_kwargs_from_robomimic(env_args: str | dict[str, Any]) -> dict[str, Any]:
     return {"task": task, "controller_config": config, "lite_physics": kwargs.get("lite_physics", True)}
 
 
-def _parsed(env_args: str | dict[str, Any]) -> dict[str, Any]:
+def _parsed(env_args: str | dict[str, Any]) -> tuple[str | None, dict[str, Any]]:
+    """The task, None for one that is not ours, and all that is said of its environment."""
     arguments: dict[str, Any] = json.loads(env_args) if isinstance(env_args, str) else env_args
-    return arguments
-
-
-def _task(arguments: dict[str, Any]) -> str | None:
-    if arguments.get("type", ROBOSUITE_TYPE) != ROBOSUITE_TYPE:
-        return None
-    tasks = {row.environment: task for task, row in TASKS.items()}
-    return tasks.get(arguments.get("env_name", ""))
+    tasks = {(ROBOSUITE_TYPE, row.environment): task for task, row in TASKS.items()}
+    return tasks.get((arguments.get("type", ROBOSUITE_TYPE), arguments.get("env_name", ""))), arguments
 
 
 def _env_id(task: str) -> str:

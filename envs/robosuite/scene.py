@@ -8,7 +8,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -120,7 +120,7 @@ def scene_xml(env: Any, variation: "SceneVariation | None") -> str:
     return ET.tostring(root, encoding="unicode")
 
 
-class SceneVariation(Protocol):
+class SceneVariation:
     """What one episode's scene has otherwise than another's, beside the positions and velocities that a state holds."""
 
     def draw(self, env: Any, rng: np.random.Generator) -> None:
@@ -138,6 +138,7 @@ class SceneVariation(Protocol):
         :param env: robosuite's environment
         :param scene: root of the XML
         """
+        raise NotImplementedError
 
     def read(self, env: Any, scene: ET.Element) -> None:
         """
@@ -146,9 +147,10 @@ class SceneVariation(Protocol):
         :param env: robosuite's environment
         :param scene: root of the recorded XML
         """
+        raise NotImplementedError
 
 
-class CubeSize:
+class CubeSize(SceneVariation):
     """Lift's cube, which robosuite draws whenever it builds the scene; here it changes in the compiled one."""
 
     def draw(self, env: Any, rng: np.random.Generator) -> None:
@@ -162,7 +164,7 @@ class CubeSize:
         set_cube_size(env, np.array(_named(scene, "geom", "cube_g0").get("size", "").split(), np.float64))
 
 
-class BodyPoses:
+class BodyPoses(SceneVariation):
     """
     Bodies without a joint, which robosuite's reset puts elsewhere in the compiled scene.
 
@@ -171,9 +173,6 @@ class BodyPoses:
 
     def __init__(self, *names: str) -> None:
         self.names = names
-
-    def draw(self, env: Any, rng: np.random.Generator) -> None:
-        pass
 
     def write(self, env: Any, scene: ET.Element) -> None:
         model = env.sim.model

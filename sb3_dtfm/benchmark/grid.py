@@ -116,6 +116,8 @@ def plan(options: argparse.Namespace) -> tuple[list[Job], list[Cell]]:
                 _check_length(cell, finished[cell], wanted["n_timesteps"], options.results)
                 done.append(cell)
                 continue
+            if (rows := Path(options.results) / f"{cell.file_name}.jsonl") in files:
+                raise UsageError(f"{cell}: {rows} is there, without a final evaluation of this cell; move it away.")
             if task.env_id not in data:
                 kwargs = wanted.get("dataset_kwargs") or {}
                 data[task.env_id] = describe_data(task.env_id, wanted["dataset"], kwargs, task.recorded_from)

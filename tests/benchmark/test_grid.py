@@ -17,7 +17,7 @@ from filelock import FileLock
 from sb3_dtfm import DTFM
 from sb3_dtfm.benchmark import runner
 from sb3_dtfm.benchmark.grid import plan, read_tasks
-from sb3_dtfm.benchmark.rows import read_rows
+from sb3_dtfm.benchmark.rows import read_rows, write_row
 from sb3_dtfm.benchmark.settings import Task, task_settings
 from sb3_dtfm.cli.benchmark import parse_arguments
 from sb3_dtfm.cli.main import main
@@ -244,6 +244,15 @@ def test_the_first_seed_of_everything_comes_first(grid, monkeypatch):
     ]
     assert {json.dumps(job.data) for job in jobs} == {json.dumps(jobs[0].data)}
     assert done == []
+
+
+def test_a_file_of_other_rows_is_not_taken_for_the_cell(grid, workplace, row):
+    """Two labels can become the same file name."""
+    (workplace / "results").mkdir()
+    other = {**row, "task": TASK, "algo": "dt", "profile": "tiny", "label": "a b"}
+    write_row(workplace / "results" / f"{TASK}_1_dt_seed0_tiny_a-b.jsonl", other)
+    with pytest.raises(UsageError, match=r"dt, seed 0, tiny, a-b: .*a-b.jsonl is there, without a final evaluation"):
+        plan(parse_arguments([*grid[1:], "--label", "a-b"]))
 
 
 def test_algorithms_with_different_trunks_are_refused(grid, workplace):
