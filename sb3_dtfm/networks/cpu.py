@@ -1,5 +1,6 @@
 """
-What only makes a CPU faster: dropout masks, and products of few rows. Without this file the numbers would be the same.
+What only makes a CPU faster: dropout masks, products of few rows, and memory for kept keys and values. Without this file the
+numbers would be the same.
 
 Measured on 2 cores of an AMD EPYC with AVX2, in microseconds, with weights that lie outside of the cache:
 
@@ -12,7 +13,12 @@ Measured on 2 cores of an AMD EPYC with AVX2, in microseconds, with weights that
 | 256 x 3072 | 1 / 3 | 458 / 910 | 182 / 332 |
 
 All weights of a small model stay in the cache, and there torch is the faster one up to `LARGE_WEIGHT`.
+
+Kept keys and values, copied at every step instead of appended to, make an action for 16 environments at the paper's size
+take 21 % longer (19 MB). A dropout mask takes an eighth of torch's time.
 """
+
+import contextlib
 
 import numpy as np
 import torch as th
@@ -25,6 +31,8 @@ LEVELS = 1 << 16
 FEW_ROWS = 4
 # Numbers in a weight from which that pays.
 LARGE_WEIGHT = 1 << 17
+# Steps that fit behind what is kept before it moves to new memory.
+ROOM = 20
 
 
 class Linear(nn.Linear):
@@ -91,3 +99,42 @@ def dropout_add(residual: th.Tensor, x: th.Tensor, probability: float, training:
 def _draws_masks_here(x: th.Tensor) -> bool:
     """A compiled graph draws its own, fused with what uses them."""
     return x.device.type == "cpu" and not th.compiler.is_compiling()
+
+
+class Kept(np.ndarray):
+    """
+    Keys and values of earlier steps, (B, layers, 2, L, D), which never change, and the memory behind them.
+
+    :ivar behind: that memory, shaped like this but longer, and where these end in it: for the first who takes it, from
+        whatever thread. Copies have none, nor has what NumPy computes.
+    """
+
+    behind: list[tuple[th.Tensor, int]]
+
+
+def hand_out(memory: th.Tensor, start: int, end: int) -> Kept:
+    """
+    :param memory: (B, layers, 2, M, D), on any device
+    :param start: of what is kept, along the fourth axis
+    :param end: of what is kept
+    """
+    kept = memory[..., start:end, :].cpu().numpy().view(Kept)
+    kept.behind = [(memory, end)]
+    return kept
+
+
+def take_up(kept: np.ndarray, n_tokens: int, device: th.device) -> tuple[th.Tensor, int]:
+    """
+    :param kept: what :func:`hand_out` gave, a copy of it, or another array like it
+    :param n_tokens: how many will be appended
+    :param device: where they will
+    :return: memory with room for them that is nobody else's, and where `kept` ends in it
+    """
+    with contextlib.suppress(IndexError):
+        memory, end = getattr(kept, "behind", []).pop()
+        if end + n_tokens <= memory.shape[3] and memory.device == device:
+            return memory, end
+    end = kept.shape[3]
+    memory = th.empty(*kept.shape[:3], end + ROOM * n_tokens, kept.shape[4], device=device)
+    memory[..., :end, :] = th.from_numpy(kept).to(device)
+    return memory, end

@@ -15,8 +15,8 @@ from torch import nn
 
 from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, PROBABILITY_BELOW_1, Rule, check_arguments
 from sb3_dtfm.heads import ActionHead
+from sb3_dtfm.networks.cpu import hand_out, take_up
 from sb3_dtfm.networks.trunk import TOKENS_PER_STEP, SequenceTrunk
-from sb3_dtfm.policies.kept import hand_out, take_up
 from sb3_dtfm.policies.memory import RememberedContext
 from sb3_dtfm.policies.normalization import Normalization
 from sb3_dtfm.windows import Context, Windows, empty_context, push, restarts, unpack_observation, with_action
