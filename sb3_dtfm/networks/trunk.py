@@ -1,4 +1,4 @@
-"""The causal Transformer over return-to-go, observation and action tokens that `DT` and `DTFM` share."""
+"""The causal Transformer over returns-to-go, observations and actions that `DT` and `DTFM` share."""
 
 import torch as th
 from torch import nn
@@ -7,8 +7,6 @@ from torch.nn import functional as F
 from sb3_dtfm.networks.cpu import Linear, dropout, dropout_add
 
 ALL = slice(None)
-# Tokens that a step adds while acting: the last action, the return-to-go and the observation.
-TOKENS_PER_STEP = 3
 
 
 class TransformerBlock(nn.Module):
@@ -91,9 +89,12 @@ class SequenceTrunk(nn.Module):
     """
     Decision Transformer trunk (Chen et al., 2021): a window of steps in, one hidden state per step out.
 
-    Each step gives three tokens, return-to-go, observation and action, each by its own linear map plus a learned
-    embedding of the absolute time step. The hidden state of step t is read at its observation token: it has seen
-    return-to-go and observation of t and everything before them, and not the action of t.
+    Return-to-go, observation and action are embedded by a linear map each, plus a learned embedding of the absolute time
+    step. They make three tokens, or one, the sum of a step's return-to-go, its observation and the action before it: a
+    third of the products, a ninth of the attention. The hidden state of step t is read at its observation's token: it has
+    seen return-to-go and observation of t and everything before them, and not the action of t.
+
+    The action before the oldest step of a window is out of sight: no token of three, no summand of one.
 
     Without `timestep_embedding` the order of tokens shows in the causal mask alone (Kazemnejad et al., 2023), and nothing
     is learned that holds for one time step only.
@@ -106,6 +107,7 @@ class SequenceTrunk(nn.Module):
     :param n_heads: attention heads, a divisor of `embed_dim`
     :param dropout: probability on embeddings, attention weights and residual branches
     :param timestep_embedding: add the embeddings of time steps
+    :param tokens_per_step: 3 or 1
     """
 
     def __init__(
@@ -118,6 +120,7 @@ class SequenceTrunk(nn.Module):
         n_heads: int = 2,
         dropout: float = 0.1,
         timestep_embedding: bool = True,
+        tokens_per_step: int = 3,
     ) -> None:
         super().__init__()
         if embed_dim % n_heads:
@@ -125,6 +128,8 @@ class SequenceTrunk(nn.Module):
         self.embed_dim = embed_dim
         self.n_layers = n_layers
         self.n_heads = n_heads
+        self.tokens_per_step = tokens_per_step
+        self.observation_tokens = ALL if tokens_per_step == 1 else slice(1, None, tokens_per_step)
         self.embed_return_to_go = Linear(1, embed_dim)
         self.embed_observation = Linear(observation_dim, embed_dim)
         self.embed_action = Linear(action_dim, embed_dim)
@@ -162,20 +167,13 @@ class SequenceTrunk(nn.Module):
         :param last_only: compute the newest step's hidden state alone
         :return: (B, K, D) hidden states, (B, 1, D) with `last_only`
         """
-        time = self._time(timesteps)
-        triples = (
-            self.embed_return_to_go(returns_to_go.unsqueeze(-1)) + time,
-            self.embed_observation(observations) + time,
-            self.embed_action(actions) + time,
-        )
-        tokens = th.stack(triples, dim=2).flatten(1, 2)[:, :-1]  # nothing attends to the last action
+        tokens = self._tokens(observations, actions, returns_to_go, timesteps, mask)
         tokens = dropout(tokens, self.dropout, self.training)
-        attention_bias = self._attention_bias(causal_mask(mask.repeat_interleave(3, dim=1)[:, :-1]))
+        attention_bias = self._attention_bias(mask, tokens.shape[1])
         *lower_blocks, last_block = self.blocks
         for block in lower_blocks:
             tokens = block(tokens, attention_bias)
-        observation_tokens = slice(-1, None) if last_only else slice(1, None, 3)
-        return self.final_norm(last_block(tokens, attention_bias, observation_tokens))
+        return self.final_norm(last_block(tokens, attention_bias, slice(-1, None) if last_only else self.observation_tokens))
 
     def extend(
         self,
@@ -187,32 +185,47 @@ class SequenceTrunk(nn.Module):
         keys_values: th.Tensor,
     ) -> th.Tensor:
         """
-        The newest step's hidden state from what earlier steps left behind: three new tokens instead of a whole window.
+        The newest step's hidden state from what earlier steps left behind: one step's tokens instead of a whole window's.
 
-        The new tokens are the last action, the return-to-go and the observation. They attend to the same steps as in
+        Three new tokens are the last action, the return-to-go and the observation. They attend to the same steps as in
         :meth:`forward`; but a kept step was itself computed with the steps before it, which reach back further than
         this window once it slides. Equal to :meth:`forward` for the first K steps of an episode, and to attention with a
         band of K steps over the whole episode from then on.
 
         :param observations: (B, K, O), and the others as for :meth:`forward`; the last two steps are read
-        :param keys_values: (B, layers, 2, 3 K, D), those of the K - 1 steps before, any finite number where `mask` is False;
-            the last three tokens' are filled in here
+        :param keys_values: (B, layers, 2, L, D) for the L tokens of K steps (:meth:`n_tokens`), any finite number where
+            `mask` is False; those of the last `tokens_per_step` tokens are filled in here
         :return: (B, D) hidden state
         """
-        time = self._time(timesteps[:, -2:])
-        new = (
-            self.embed_action(actions[:, -2]) + time[:, 0],
-            self.embed_return_to_go(returns_to_go[:, -1:]) + time[:, 1],
-            self.embed_observation(observations[:, -1]) + time[:, 1],
-        )
-        tokens = th.stack(new, dim=1)
-        # In triples of action before, return-to-go, observation; the action before the oldest step is out of sight.
-        seen = th.stack((F.pad(mask[:, :-1], (1, 0)), mask, mask), dim=2).flatten(1)
-        attention_bias = self._attention_bias(causal_mask(seen)[:, :, -3:])
+        newest = (x[:, -2:] for x in (observations, actions, returns_to_go, timesteps, mask))
+        tokens = self._tokens(*newest)[:, -self.tokens_per_step :]
+        attention_bias = self._attention_bias(mask, keys_values.shape[3])[:, :, -self.tokens_per_step :]
         for block, block_keys_values in zip(self.blocks, keys_values.unbind(dim=1), strict=True):
             assert isinstance(block, TransformerBlock)
             tokens = block.extend(tokens, block_keys_values, attention_bias)
         return self.final_norm(tokens[:, -1])
+
+    def n_tokens(self, context_length: int) -> int:
+        """Tokens of a window of K steps; of three a step the last action's is left out, since nothing attends to it."""
+        return context_length if self.tokens_per_step == 1 else self.tokens_per_step * context_length - 1
+
+    def _tokens(
+        self,
+        observations: th.Tensor,
+        actions: th.Tensor,
+        returns_to_go: th.Tensor,
+        timesteps: th.Tensor,
+        mask: th.Tensor,
+    ) -> th.Tensor:
+        """Embed a window: (B, L, D) in the order of time, the newest observation's token last."""
+        time = self._time(timesteps)
+        return_to_go = self.embed_return_to_go(returns_to_go.unsqueeze(-1)) + time
+        observation = self.embed_observation(observations)
+        action = self.embed_action(actions)
+        if self.tokens_per_step == 1:
+            known = action[:, :-1] * mask[:, :-1].unsqueeze(-1)  # padding is no action of zeros: it adds nothing at all
+            return return_to_go + observation + F.pad(known, (0, 0, 1, 0))
+        return th.stack((return_to_go, observation + time, action + time), dim=2).flatten(1, 2)[:, :-1]
 
     def _time(self, timesteps: th.Tensor) -> th.Tensor:
         """What to add to the tokens of steps (B, N): embeddings (B, N, D), or zeros (B, N, 1) where there are none."""
@@ -220,8 +233,9 @@ class SequenceTrunk(nn.Module):
             return th.zeros_like(timesteps, dtype=self.final_norm.weight.dtype).unsqueeze(-1)
         return self.embed_timestep(timesteps.clamp(max=self.embed_timestep.num_embeddings - 1))
 
-    def _attention_bias(self, allowed: th.Tensor) -> th.Tensor:
-        """From (B, 1, Q, L) bool to (B, heads, Q, L): what is added to the scores."""
+    def _attention_bias(self, mask: th.Tensor, n_tokens: int) -> th.Tensor:
+        """From the steps' mask, (B, K), to what is added to the scores of their first tokens, (B, heads, L, L)."""
+        allowed = causal_mask(mask.repeat_interleave(self.tokens_per_step, dim=1)[:, :n_tokens])
         bias = th.zeros_like(allowed, dtype=self.final_norm.weight.dtype).masked_fill_(~allowed, -th.inf)
         return bias.expand(-1, self.n_heads, -1, -1)
 

@@ -13,10 +13,10 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, PROBABILITY_BELOW_1, Rule, check_arguments
+from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, PROBABILITY_BELOW_1, Choice, Rule, check_arguments
 from sb3_dtfm.heads import ActionHead
 from sb3_dtfm.networks.cpu import hand_out, take_up
-from sb3_dtfm.networks.trunk import TOKENS_PER_STEP, SequenceTrunk
+from sb3_dtfm.networks.trunk import SequenceTrunk
 from sb3_dtfm.policies.memory import RememberedContext
 from sb3_dtfm.policies.normalization import Normalization
 from sb3_dtfm.windows import Context, Windows, empty_context, push, restarts, unpack_observation, with_action
@@ -31,6 +31,7 @@ ACCEPTED: dict[str, Rule] = {
     "n_heads": COUNT,
     "dropout": PROBABILITY_BELOW_1,
     "timestep_embedding": BOOLEAN,
+    "tokens_per_step": Choice((1, 3)),
     "weight_decay": NOT_NEGATIVE,
     "clip_return_to_go": BOOLEAN,
     "kv_cache": BOOLEAN,
@@ -67,6 +68,8 @@ class SequencePolicy(BasePolicy):
     :param n_heads: attention heads
     :param dropout: dropout probability of the trunk
     :param timestep_embedding: tell the trunk the absolute time step, as Decision Transformer does
+    :param tokens_per_step: 3, return-to-go, observation and action, as Decision Transformer does; or 1, the sum of a step's
+        return-to-go, its observation and the action before it: a third of the products
     :param weight_decay: AdamW's, on weight matrices only
     :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step. Asking for more than
         any episode reached, or falling behind, then stays an input like those the policy learned from
@@ -95,6 +98,7 @@ class SequencePolicy(BasePolicy):
         n_heads: int = 2,
         dropout: float = 0.1,
         timestep_embedding: bool = True,
+        tokens_per_step: int = 3,
         weight_decay: float = 1e-3,
         clip_return_to_go: bool = False,
         ema: bool = False,
@@ -114,8 +118,8 @@ class SequencePolicy(BasePolicy):
         self.observation_dim = int(observation_space["observation"].shape[0])  # type: ignore[index]
         self.action_dim = int(action_space.shape[0])
         self.normalization = Normalization(self.observation_dim, action_space, max_timestep, clip_return_to_go)
-        dims = (self.observation_dim, self.action_dim)
-        trunk = SequenceTrunk(*dims, max_timestep, embed_dim, n_layers, n_heads, dropout, timestep_embedding)
+        sizes = (self.observation_dim, self.action_dim, max_timestep, embed_dim, n_layers, n_heads)
+        trunk = SequenceTrunk(*sizes, dropout, timestep_embedding, tokens_per_step)
         self.network = SequenceNetwork(trunk, self.head_class(embed_dim, self.action_dim, **head_options))
         self.ema_network = copy.deepcopy(self.network).requires_grad_(False) if ema else None
         self.optimizer = self._make_optimizer(lr_schedule(1.0))
@@ -307,11 +311,14 @@ class SequencePolicy(BasePolicy):
         The newest hidden states from what was kept, and what to keep for the next step.
 
         :param windows: normalised
-        :param kept: (B, layers, 2, 3 (K - 1), D), or (B, 0) if the last steps were acted without a cache
+        :param kept: (B, layers, 2, L, D) for the L tokens before the newest, or (B, 0) if the last steps were acted without
+            a cache
         :return: (B, D) hidden states, and the new `kept`
         """
         trunk, device = self.acting_network.trunk, windows.mask.device
-        shape = (len(windows.mask), trunk.n_layers, 2, TOKENS_PER_STEP * (self.context_length - 1), trunk.embed_dim)
+        n_new = trunk.tokens_per_step
+        n_kept = trunk.n_tokens(self.context_length) - n_new
+        shape = (len(windows.mask), trunk.n_layers, 2, n_kept, trunk.embed_dim)
         n_missing = 0
         if kept.shape != shape:
             kept = np.zeros(shape, np.float32)
@@ -319,10 +326,10 @@ class SequencePolicy(BasePolicy):
         for n_back in range(n_missing, -1, -1):
             earlier = Windows(*(x.roll(n_back, dims=1) for x in windows)) if n_back else windows
             earlier.mask[:, :n_back] = False  # the newest steps went round to the left
-            memory, end = take_up(kept, TOKENS_PER_STEP, device)
-            start, end = end - shape[3], end + TOKENS_PER_STEP
+            memory, end = take_up(kept, n_new, device)
+            start, end = end - n_kept, end + n_new
             hidden = trunk.extend(**earlier._asdict(), keys_values=memory[..., start:end, :])
-            kept = hand_out(memory, start + TOKENS_PER_STEP, end)
+            kept = hand_out(memory, start + n_new, end)
         return hidden, kept
 
     def _acting_noise(self, context: Context, deterministic: bool) -> th.Tensor:

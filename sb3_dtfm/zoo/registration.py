@@ -91,5 +91,6 @@ def _sample_trunk(trial: optuna.Trial) -> dict[str, Any]:
         "n_heads_pow": trial.suggest_int("n_heads_pow", 0, 2),
         "dropout": trial.suggest_float("dropout", 0.0, 0.3),
         "timestep_embedding": trial.suggest_categorical("timestep_embedding", [True, False]),
+        "tokens_per_step": trial.suggest_categorical("tokens_per_step", [1, 3]),
         "clip_return_to_go": trial.suggest_categorical("clip_return_to_go", [True, False]),
     }

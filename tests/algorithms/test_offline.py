@@ -236,6 +236,17 @@ def test_without_time_steps_and_with_more_starts(algorithm, policy_kwargs, cheet
     assert loaded.policy.network.trunk.embed_timestep is None
 
 
+@pytest.mark.parametrize(("algorithm", "policy_kwargs"), ALGORITHMS, ids=IDS)
+def test_one_token_a_step_trains_and_is_saved(algorithm, policy_kwargs, cheetah_buffer, tmp_path):
+    model = make_model(algorithm, cheetah_buffer, policy_kwargs={**policy_kwargs, "tokens_per_step": 1}).learn(3)
+    model.save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model", dataset=cheetah_buffer)
+    assert loaded.policy.network.trunk.tokens_per_step == 1
+    observation, _ = make_env().reset(seed=0)
+    assert np.array_equal(*(each.predict(observation, deterministic=True)[0] for each in (model, loaded)))
+    assert loaded.learn(1).num_timesteps == 1
+
+
 def test_learning_rate_warms_up_and_decays(cheetah_buffer):
     rates = logged_learning_rates(
         make_model(DT, cheetah_buffer, learning_rate=1.0e-3, warmup_steps=4, learning_rate_schedule="linear"), 10

@@ -8,15 +8,21 @@ from sb3_dtfm.networks.trunk import SequenceTrunk, causal_mask
 B, K, OBSERVATION_DIM, A = 3, 6, 5, 2
 
 
-def make_trunk(timestep_embedding: bool) -> SequenceTrunk:
+def make_trunk(tokens_per_step: int, timestep_embedding: bool) -> SequenceTrunk:
     th.manual_seed(0)
-    sizes = dict(max_timestep=50, embed_dim=16, n_layers=2, n_heads=2)
-    return SequenceTrunk(OBSERVATION_DIM, A, **sizes, dropout=0.0, timestep_embedding=timestep_embedding)
+    sizes = dict(max_timestep=50, embed_dim=16, n_layers=2, n_heads=2, dropout=0.0)
+    options = dict(tokens_per_step=tokens_per_step, timestep_embedding=timestep_embedding)
+    return SequenceTrunk(OBSERVATION_DIM, A, **sizes, **options)
+
+
+@pytest.fixture(params=[3, 1], ids=["3 tokens", "1 token"])
+def tokens_per_step(request) -> int:
+    return request.param
 
 
 @pytest.fixture(params=[True, False], ids=["timesteps", "no timesteps"])
-def trunk(request) -> SequenceTrunk:
-    return make_trunk(request.param)
+def trunk(request, tokens_per_step) -> SequenceTrunk:
+    return make_trunk(tokens_per_step, request.param)
 
 
 @pytest.fixture
@@ -45,13 +51,33 @@ def test_a_hidden_state_sees_its_own_step_and_everything_before(trunk, window, n
 
 
 @pytest.mark.parametrize(("timestep_embedding", "changed"), [(True, [2, 3, 4, 5]), (False, [])])
-def test_time_steps_are_seen_where_they_have_embeddings(timestep_embedding, changed, window):
-    assert changed_steps(make_trunk(timestep_embedding), window, "timesteps", 2) == changed
+def test_time_steps_are_seen_where_they_have_embeddings(timestep_embedding, changed, tokens_per_step, window):
+    assert changed_steps(make_trunk(tokens_per_step, timestep_embedding), window, "timesteps", 2) == changed
 
 
 def test_an_action_is_seen_from_the_next_step_on(trunk, window):
     assert changed_steps(trunk, window, "actions", 2) == [3, 4, 5]
     assert changed_steps(trunk, window, "actions", K - 1) == []
+
+
+def test_a_step_is_one_token_of_its_return_to_go_its_observation_and_the_action_before_it(window):
+    """No action is known before the oldest step: its token lacks the summand, and not even the bias is in it."""
+    trunk = make_trunk(1, timestep_embedding=True)
+    th.nn.init.normal_(trunk.embed_action.bias)
+    window["mask"] = th.arange(K).repeat(B, 1) >= th.tensor([[0], [2], [K - 1]])
+    tokens = trunk._tokens(**window)
+    assert tokens.shape == (B, K, 16)
+    for row, step in window["mask"].nonzero().tolist():
+        expected = trunk.embed_return_to_go(window["returns_to_go"][row, step].reshape(1))
+        expected = expected + trunk.embed_observation(window["observations"][row, step]) + trunk.embed_timestep.weight[step]
+        if step > 0 and window["mask"][row, step - 1]:
+            expected = expected + trunk.embed_action(window["actions"][row, step - 1])
+        th.testing.assert_close(tokens[row, step], expected)
+
+
+def test_a_window_has_as_many_tokens_as_it_says(trunk, window):
+    assert [trunk.n_tokens(K), trunk.n_tokens(1)] == ([K, 1] if trunk.tokens_per_step == 1 else [3 * K - 1, 2])
+    assert trunk._tokens(**window).shape[1] == trunk.n_tokens(K)
 
 
 def test_padding_on_the_left_changes_no_hidden_state(trunk, window):
@@ -106,22 +132,22 @@ def test_a_block_gives_each_query_what_it_gives_it_among_all(trunk, window):
 
 
 def keep_extending(trunk, window, n_steps):
-    """Hidden states of an episode's steps, each from three new tokens, with a window of K steps."""
+    """Hidden states of an episode's steps, each from the tokens that it adds, with a window of K steps."""
     trunk.requires_grad_(False)
-    batch, context_length = len(window["mask"]), K
-    kept = th.zeros(batch, trunk.n_layers, 2, 3 * (context_length - 1), trunk.embed_dim)
+    n_new = trunk.tokens_per_step
+    kept = th.zeros(len(window["mask"]), trunk.n_layers, 2, trunk.n_tokens(K) - n_new, trunk.embed_dim)
     hidden_states = []
     for step in range(n_steps):
-        first = max(0, step + 1 - context_length)
-        pad = context_length - (step + 1 - first)
+        first = max(0, step + 1 - K)
+        pad = K - (step + 1 - first)
         seen = {key: value[:, first : step + 1] for key, value in window.items()}
         padded = {
             key: th.cat((th.zeros_like(value[:, :1].expand(-1, pad, *value.shape[2:])), value), 1)
             for key, value in seen.items()
         }
-        keys_values = th.nn.functional.pad(kept, (0, 0, 0, 3))
+        keys_values = th.nn.functional.pad(kept, (0, 0, 0, n_new))
         hidden = trunk.extend(**padded, keys_values=keys_values)
-        kept = keys_values[:, :, :, 3:]
+        kept = keys_values[:, :, :, n_new:]
         hidden_states.append(hidden)
     return th.stack(hidden_states, dim=1)
 
@@ -142,7 +168,8 @@ def test_kept_keys_and_values_are_attention_with_a_band_once_the_window_slides(t
         mask=th.ones(B, length, dtype=th.bool),
     )
     extended = keep_extending(trunk, episode, length)
-    step, kind = th.arange(3 * length - 1) // 3, th.arange(3 * length - 1) % 3
+    token = th.arange(trunk.n_tokens(length))
+    step, kind = token // trunk.tokens_per_step, token % trunk.tokens_per_step
     reader = step + (kind == 2)  # an action is first read, and computed, with the step after it
     band = (step[None] > reader[:, None] - K).unsqueeze(0).unsqueeze(0)
     plain = causal_mask

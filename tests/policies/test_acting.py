@@ -14,9 +14,10 @@ from sb3_dtfm.windows import empty_context
 from tests.conftest import TINY_FLOW_POLICY, TINY_POLICY, make_env
 
 ALGORITHMS = [(DT, TINY_POLICY), (DTFM, TINY_FLOW_POLICY)]
+ONE_TOKEN = [(algorithm, {**policy_kwargs, "tokens_per_step": 1}) for algorithm, policy_kwargs in ALGORITHMS]
 
 
-@pytest.fixture(params=ALGORITHMS, ids=["dt", "dtfm"])
+@pytest.fixture(params=ALGORITHMS + ONE_TOKEN, ids=["dt", "dtfm", "dt, one token", "dtfm, one token"])
 def model(request, cheetah_buffer):
     algorithm, policy_kwargs = request.param
     return algorithm(

@@ -35,10 +35,13 @@ def roll(model, observations: np.ndarray, barrier: Barrier | None = None) -> np.
     return np.array(actions)
 
 
+@pytest.mark.parametrize("tokens_per_step", [3, 1])
 @pytest.mark.parametrize(("algorithm", "policy_kwargs"), [(DT, TINY_POLICY), (DTFM, TINY_FLOW_POLICY)])
-def test_threads_with_their_own_states_act_as_alone_to_the_bit(algorithm, policy_kwargs, cheetah_buffer, frequent_switches):
+def test_threads_with_their_own_states_act_as_alone_to_the_bit(
+    algorithm, policy_kwargs, tokens_per_step, cheetah_buffer, frequent_switches
+):
     """With what is kept of earlier steps, over the window's slide."""
-    policy_kwargs = dict(policy_kwargs, kv_cache=True)
+    policy_kwargs = dict(policy_kwargs, kv_cache=True, tokens_per_step=tokens_per_step)
     model = algorithm("MultiInputPolicy", dataset=cheetah_buffer, context_length=5, policy_kwargs=policy_kwargs, seed=0)
     episodes = [episode.observations for episode in record_random_episodes(N_THREADS, seed=100)]
     expected = [roll(model, observations) for observations in episodes]
