@@ -11,7 +11,6 @@ import minari
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from gymnasium.envs.registration import parse_env_id
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.vec_env import VecEnv
@@ -216,15 +215,11 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
     @staticmethod
     def _check_task(buffer: TrajectoryBuffer, env: VecEnv) -> None:
         """
-        :raises DatasetError: the data were recorded in another environment; versions may differ
+        :raises DatasetError: the data were recorded in another environment
         """
         (spec,) = env.get_attr("spec", indices=0)
-        if spec is None or buffer.env_id is None or parse_env_id(spec.id)[:2] == parse_env_id(buffer.env_id)[:2]:
-            return
-        raise DatasetError(
-            f"{buffer.source} was recorded in {buffer.env_id}, and the environment is {spec.id}. If the data are meant for "
-            f"it, say so with dataset_kwargs={{'env_id': {spec.id!r}}}."
-        )
+        if spec is not None:
+            buffer.check_task(spec.id)
 
     def _setup_model(self) -> None:
         self._check_arguments(learning_rate=NOT_NEGATIVE)

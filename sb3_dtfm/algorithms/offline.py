@@ -93,7 +93,7 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         :param progress_bar: show one
         :return: the model
         :raises ValueError: no dataset, or an argument out of range
-        :raises FloatingPointError: the loss or its gradient is no longer finite; the weights are those from before
+        :raises FloatingPointError: the loss or its gradient is no longer finite; such a step changes no weight
         """
         buffer = self.buffer or self._load_buffer()
         total_timesteps, callback = self._setup_learn(

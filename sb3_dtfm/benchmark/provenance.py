@@ -14,10 +14,9 @@ import h5py
 import minari
 import numpy as np
 import torch as th
-from gymnasium.envs.registration import parse_env_id
 
 import sb3_dtfm
-from sb3_dtfm.data import DatasetError, load_dataset
+from sb3_dtfm.data import load_dataset
 
 PACKAGES = ("sb3-dtfm", "torch", "stable-baselines3", "rl_zoo3", "gymnasium", "mujoco", "robosuite", "numpy")
 GIT_TIMEOUT = 20  # seconds
@@ -86,11 +85,7 @@ def describe_data(
     :raises DatasetError: it cannot be read, or was recorded on another task; versions may differ
     """
     buffer = load_dataset(dataset, **dataset_kwargs)
-    if buffer.env_id is not None and parse_env_id(buffer.env_id)[:2] != parse_env_id(env_id)[:2]:
-        raise DatasetError(
-            f"{buffer.source} was recorded in {buffer.env_id}, and the task is {env_id}. If the data are meant for it, say "
-            f"so with --label and -params \"dataset_kwargs:{{'env_id': {env_id!r}}}\"."
-        )
+    buffer.check_task(env_id)
     in_file = Path(dataset).expanduser().is_file()
     return {
         "dataset": Path(dataset).name if in_file else dataset,

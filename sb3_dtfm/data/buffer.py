@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from gymnasium.envs.registration import parse_env_id
 
 from sb3_dtfm.data.episodes import EpisodeTable, Statistics, moments
 from sb3_dtfm.data.storage import STEP_ARRAYS, FileStorage, MappedSteps, MemoryStorage
@@ -195,6 +196,20 @@ class TrajectoryBuffer:
         low = th.full((n_timesteps,), th.inf).scatter_reduce_(0, timesteps, values, "amin")
         high = th.full((n_timesteps,), -th.inf).scatter_reduce_(0, timesteps, values, "amax")
         return th.stack((low, high))
+
+    def check_task(self, env_id: str) -> None:
+        """
+        Refuse the data of another task; versions may differ, and data that do not tell are taken.
+
+        :param env_id: Gymnasium id of the environment that is to be learned
+        :raises DatasetError: names both environments, and how to insist
+        """
+        if self.env_id is None or parse_env_id(self.env_id)[:2] == parse_env_id(env_id)[:2]:
+            return
+        raise DatasetError(
+            f"{self.source} was recorded in {self.env_id}, and the environment is {env_id}. If the data are meant for it, "
+            f"say so with dataset_kwargs={{'env_id': {env_id!r}}} (-params on the command line)."
+        )
 
     def select(self, episodes: np.ndarray) -> "TrajectoryBuffer":
         """

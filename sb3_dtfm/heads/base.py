@@ -24,12 +24,10 @@ class ActionHead(nn.Module, ABC):
 
     algorithm: ClassVar[str]
     acting_choices: ClassVar[tuple[str, ...]] = ()
+    noise_dim: int = 0
 
     def __init__(self, embed_dim: int, action_dim: int) -> None:
         super().__init__()
-        self.embed_dim = embed_dim
-        self.action_dim = action_dim
-        self.noise_dim = 0
 
     @classmethod
     def options(cls) -> dict[str, Any]:

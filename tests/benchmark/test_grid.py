@@ -275,7 +275,7 @@ def test_algorithms_with_different_trunks_are_refused(grid, workplace):
         (["--dataset", f"{TASK}=nowhere.hdf5"], "nowhere.hdf5 does not exist"),
         (
             ["--dataset", f"Walker2d-v5={DATASET_ID}"],
-            f"was recorded in {TASK}, and the task is Walker2d-v5. If the data are meant for it, say so with",
+            f"was recorded in {TASK}, and the environment is Walker2d-v5. If the data are meant for it, say so with",
         ),
         (["--env", "Hopper-v5"], "--dataset, --target-return: needed for Hopper-v5"),
         (["--env", TASK, "--profile", "nowhere.yml"], "--profile nowhere.yml: nowhere.yml does not exist"),
