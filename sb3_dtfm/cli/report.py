@@ -34,7 +34,7 @@ def main(argv: Sequence[str]) -> None:
     )
     baseline = "curve of an SB3 run: its evaluations.npz"
     argument("--baseline", action="append", default=[], metavar="[TASK:]NAME=FILE", help=baseline)
-    argument("--no-agent-line", action="store_true", help="do not draw the return of the recorded episodes")
+    argument("--no-agent-line", action="store_true", help="do not draw what the recorded episodes reached")
     options = parser.parse_args(argv)
     studies = read_studies(options.results, options.tasks)
     if not any(study.groups for study in studies):
@@ -44,11 +44,13 @@ def main(argv: Sequence[str]) -> None:
         baselines, list(dict.fromkeys(task for study in studies for group in study.groups for task in group.tasks))
     )
     output = Path(options.output)
+    agent_line = not options.no_agent_line
     figures = {}
     for study in studies:
         for group in split_changes(study, studies)[0]:
             drawn = [
-                plot_group(group, output / figure_name("curves", study, group), baselines, not options.no_agent_line),
+                plot_group(group, output / figure_name("curves", study, group), "steps", baselines, agent_line),
+                plot_group(group, output / figure_name("minutes", study, group), "minutes", agent_line=agent_line),
                 plot_solved(group, output / figure_name("solved", study, group)),
             ]
             figures[study.name, group.title] = [file.name for file in drawn if file is not None]
@@ -59,7 +61,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def figure_name(kind: str, study: Study, group: Group) -> str:
-    """File name of a group's figure: of its learning "curves", or of what was "solved" by environment step."""
+    """File name of a group's figure: "curves" of learning, these by "minutes", or what was "solved" by environment step."""
     return (
         plain_name("-".join(part for part in dict.fromkeys((kind, group.profile, group.label, study.name)) if part)) + ".png"
     )

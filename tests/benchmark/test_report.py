@@ -1,12 +1,13 @@
 """The report on small committed rows, whose numbers can be worked out by hand."""
 
 import math
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sb3_dtfm.benchmark.report.figures import plot_group
+from sb3_dtfm.benchmark.report.figures import X_AXES, plot_group
 from sb3_dtfm.benchmark.report.runs import (
     OVER_EPISODES,
     OVER_SEEDS,
@@ -68,6 +69,7 @@ def test_an_evaluation_before_training_is_drawn_and_counts_for_no_measure(groups
 def test_the_curve_is_the_mean_over_seeds_with_a_pooled_band(groups):
     curve = learning_curve(groups["small"].of(LIFT, 1.0, "dt"))
     assert curve.steps.tolist() == [10, 20, 30, 40, 50, 60]
+    assert curve.minutes == pytest.approx(np.arange(1, 7) / 3)
     assert curve.mean.tolist() == [0.0, 37.5, 50.0, 62.5, 75.0, 50.0]
     assert (curve.low <= curve.mean).all()
     assert (curve.high >= curve.mean).all()
@@ -100,8 +102,8 @@ def test_all_that_is_drawn_lies_inside_the_axes_and_the_legend_names_the_bands(g
     monkeypatch.setattr(Figure, "savefig", lambda self, *args, **kwargs: figures.append(self) or save(self, *args, **kwargs))
     group = groups["small"]
     runs = {key: [with_returns(run, *([i, 3.0, 900.0] for i in range(6))) for run in of] for key, of in group.runs.items()}
-    for each in (group, group._replace(runs=runs)):
-        plot_group(each, tmp_path / "curves.png")
+    for each, x in product((group, group._replace(runs=runs)), X_AXES):
+        plot_group(each, tmp_path / "curves.png", x)
         (figure,) = figures
         figures.clear()
         for axis in figure.axes:
@@ -117,6 +119,35 @@ def test_all_that_is_drawn_lies_inside_the_axes_and_the_legend_names_the_bands(g
         figure.canvas.draw()
         assert figure.bbox.x0 <= legend.get_window_extent().x0
         assert legend.get_window_extent().x1 <= figure.bbox.x1
+
+
+def test_curves_by_minutes_have_each_seeds_own_clock_and_a_line_at_the_threshold(groups, tmp_path, monkeypatch):
+    from matplotlib.figure import Figure
+
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, *args, **kwargs: figures.append(self))
+    run = groups["small"].of(LIFT, 1.0, "dt")[0]
+    slow = run._replace(evaluations=[{**row, "wall_s": 3 * row["wall_s"]} for row in run.evaluations[1:]])
+    recorded = {**run.final["data"], "mean_return": 200.0}
+    returns = [with_returns(each, [3.0], [5.0]) for each in (run, slow)]
+    returns = [each._replace(final={**each.final, "data": recorded}) for each in returns]
+    for runs, level in (([run, slow], 95.0), (returns, 190.0)):
+        plot_group(groups["small"]._replace(tasks=[LIFT], runs={(LIFT, 1.0, "dt"): runs}), tmp_path / "a.png", "minutes")
+        curve, line = figures.pop().axes[0].lines
+        # 20 s of the one and 60 s of the other for each ten steps, from the 20th step on
+        assert curve.get_xdata() == pytest.approx(np.arange(2, 2 + len(curve.get_xdata())) * 40 / 60)
+        assert line.get_ydata() == [level, level]
+
+
+def test_minutes_to_the_threshold_are_those_of_the_first_evaluation_there(groups):
+    run = groups["small"].of(LIFT, 1.0, "dt")[0]
+    assert run.minutes_to_threshold == math.inf
+    assert run._replace(final={**run.final, "successes": [True] * 20, "wall_s": 90.0}).minutes_to_threshold == 1.5
+    # 1 of return was recorded: the mean is below 0.95, at it, above, below
+    returns = with_returns(run, [1.0, 0.8], [1.0, 0.9], [2.0, 2.0], [0.0, 0.0])
+    assert returns.minutes_to_threshold == pytest.approx(40 / 60)
+    for recorded in ({}, {"mean_return": None}, {"mean_return": -3.0}):
+        assert returns._replace(final={**returns.final, "data": recorded}).minutes_to_threshold is None
 
 
 def test_steps_to_success_are_those_of_all_seeds_and_failures_take_for_ever(groups):
@@ -135,20 +166,22 @@ def test_scores_are_shares_of_the_recorded_return(groups):
 def test_the_report_shows_what_was_run_and_what_was_not(tmp_path, capsys):
     assert main(["report", str(ROWS), "-o", str(tmp_path), "--tasks", LIFT, "Ant-v5"]) == 0
     text = (tmp_path / "report.md").read_text()
-    achieved, interval, steps, pace = table_row(text, LIFT, "100%")
+    achieved, interval, steps, time = table_row(text, LIFT, "100%")
     assert achieved == ["55.0 ± 7.1", "88.3 ± 10.4", "87.5 ± 17.7", "100.0 ± 0.0", "75.0 ± 0.0", "100.0 ± 0.0", "2 / 3"]
     # Late averages 50 and 60 with t of one degree of freedom: 55 +- 12.706 * 7.07 / 2**0.5;
     # 80, 85 and 100 with two: 88.3 +- 4.303 * 10.41 / 3**0.5
     assert interval[:2] == ["55.0 [0.0, 100.0]", "88.3 [62.5, 100.0]"]
     assert interval[2:] == ["75.0 [40.9, 92.9] % of 8 episodes", "100.0 [75.8, 100.0] % of 12 episodes"]
     assert steps == ["40", "40"]
-    assert pace == ["2.0", "2.0", "12.5", "12.5", "37.5", "50.0"]
+    # DT reaches it after 100 s with one seed, DTFM after 80, 40 and 120 s
+    assert time == ["2.0", "2.0", "12.5", "12.5", "1.67 (1 of 2 seeds)", "1.33"]
     assert table_row(text, LIFT, "50%")[0] == ["*not run*"] * 6 + ["0 / 0"]
     assert len(table_row(text, "Ant-v5", "100%")) == 4
-    achieved, interval, scores = table_row(text, CHEETAH, "50%")[:3]
+    achieved, interval, scores, time = table_row(text, CHEETAH, "50%")
     assert achieved[:2] == ["3,800", "6,050"]
     assert interval[0] == "3,800 (one seed, no interval)"
     assert interval[2:] == ["5,000 (one seed, no interval)", "8,000 (one seed, no interval)"]
+    assert time[-2:] == ["not reached", "not reached"]
     assert scores == ["0.38", "0.60", "0.50", "0.80", "10,000 (TQC: sampled actions)"]
     # DTFM wins all 6 pairs on Lift, and the one on HalfCheetah, which has one run of each
     single = "(no interval: 1 cell has a single run)"
@@ -156,10 +189,19 @@ def test_the_report_shows_what_was_run_and_what_was_not(tmp_path, capsys):
     assert "2 cells (task and share of the data) of 2 tasks, 7 runs" in text
     assert "Left out, as they have no final evaluation: HalfCheetah-v5, 100% of the data, dt, seed 0, small." in text
     assert "`local/halfcheetah/expert-v0`, 100 episodes, recorded from TQC: sampled actions" in text
-    assert "](curves-small.png)" in text
-    assert "](solved-small.png)" in text
-    assert (tmp_path / "curves-small.png").read_bytes().startswith(b"\x89PNG")
-    assert (tmp_path / "solved-small.png").read_bytes().startswith(b"\x89PNG")
+    for figure in ("curves-small.png", "minutes-small.png", "solved-small.png"):
+        assert f"]({figure})" in text
+        assert (tmp_path / figure).read_bytes().startswith(b"\x89PNG")
+
+
+def test_nothing_is_said_of_scores_and_minutes_where_the_recorded_return_is_not_known(tmp_path):
+    rows = (ROWS / "halfcheetah.jsonl").read_text()
+    (tmp_path / "rows.jsonl").write_text(rows.replace(', "mean_return": 10000.0', ""))
+    assert (tmp_path / "rows.jsonl").read_text() != rows
+    assert main(["report", str(tmp_path / "rows.jsonl"), "-o", str(tmp_path)]) == 0
+    _, _, scores, time = table_row((tmp_path / "report.md").read_text(), CHEETAH, "50%")
+    assert scores == ["-"] * 5
+    assert time[-2:] == ["-", "-"]
 
 
 def test_a_label_stands_beside_the_same_cell_without_it(tmp_path):
@@ -168,7 +210,8 @@ def test_a_label_stands_beside_the_same_cell_without_it(tmp_path):
         "`ema_decay: 0.99` (not 0.999), `kv_cache: True`, `target_return: 9000.0` (not 12000.0), no `warmup_steps` (not 5)"
     )
     (row,) = table_row((tmp_path / "report.md").read_text(), "ema")
-    assert row == [settings, CHEETAH, "50%", "DTFM", "-", "6,050", "9,000", "8,000", "1", "2.0", "0123456", "0123456"]
+    results, minutes = ["-", "6,050", "9,000", "8,000"], ["2.0", "2.0", "not reached", "not reached"]
+    assert row == [settings, CHEETAH, "50%", "DTFM", *results, *minutes, "0123456", "0123456", "1"]
     assert not (tmp_path / "curves-small-ema.png").exists()
 
 
@@ -178,7 +221,7 @@ def test_a_label_of_another_commit_says_so_in_its_table(tmp_path):
     (tmp_path / "again.jsonl").write_text("\n".join(again) + "\n")
     assert main(["report", str(ROWS), str(tmp_path / "again.jsonl"), "-o", str(tmp_path)]) == 0
     (row,) = table_row((tmp_path / "report.md").read_text(), "ema")
-    assert row[-2:] == ["0123456, fedcba9-dirty", "0123456"]
+    assert row[-3:] == ["0123456, fedcba9-dirty", "0123456", "2"]
 
 
 def test_a_folder_for_each_study_makes_a_part_for_each(tmp_path):

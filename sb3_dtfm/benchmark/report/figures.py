@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sb3_dtfm.benchmark.report.runs import OVER_EPISODES, OVER_SEEDS, Group, learning_curve, steps_to_success
+from sb3_dtfm.benchmark.report.runs import OVER_EPISODES, OVER_SEEDS, THRESHOLD_NAME, Group, learning_curve, steps_to_success
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,6 +22,11 @@ PANEL = (4.15, 2.5)  # inches; two panels are as wide as a README
 BANDS: dict[str, dict[str, Any]] = {
     OVER_EPISODES: dict(alpha=0.15, linewidth=0),
     OVER_SEEDS: dict(alpha=0.3, linewidth=0, hatch="////"),
+}
+# What a learning curve is drawn against: the name of the axis, and the line of what the recorded episodes reached.
+X_AXES: dict[str, tuple[str, dict[str, Any]]] = {
+    "steps": ("gradient steps", dict(linewidth=1.4, label="recorded episodes")),
+    "minutes": ("minutes of training", dict(linewidth=0.8, label=THRESHOLD_NAME)),
 }
 
 
@@ -75,21 +80,24 @@ def check_baselines(baselines: Sequence[Baseline], tasks: Sequence[str]) -> None
             raise ValueError(f"--baseline {baseline.task}:{baseline.name}: the results hold {', '.join(tasks)}.")
 
 
-def plot_group(group: Group, output: Path, baselines: Sequence[Baseline] = (), agent_line: bool = True) -> Path:
+def plot_group(
+    group: Group, output: Path, x: str = "steps", baselines: Sequence[Baseline] = (), agent_line: bool = True
+) -> Path:
     """
     Draw the learning curves of all cells of a group.
 
     :param group: the runs
     :param output: PNG file to write
+    :param x: what to draw them against: gradient "steps", or "minutes" of training without evaluations
     :param baselines: further curves
-    :param agent_line: draw the mean return of the recorded episodes
+    :param agent_line: draw the mean return of the recorded episodes; against minutes 95 % of it, or of success
     :return: `output`
     """
-    with _figure(group, group.tasks, output, "gradient steps") as axes:
+    with _figure(group, group.tasks, output, X_AXES[x][0]) as axes:
         for task, row in zip(group.tasks, axes, strict=True):
             own = [baseline for baseline in baselines if baseline.task in (None, task)]
             for regime, axis in zip(group.regimes, row, strict=True):
-                _draw_panel(axis, group, task, regime, own, agent_line)
+                _draw_panel(axis, group, task, regime, x, own, agent_line)
             runs = group.of_task(task)
             if runs and runs[0].counts_success:
                 row[0].set(ylabel="success rate (%)", ylim=(-3, 103))
@@ -164,7 +172,7 @@ def _share(regime: float) -> str:
 
 
 def _draw_panel(
-    axis: "Axes", group: Group, task: str, regime: float, baselines: Sequence[Baseline], agent_line: bool
+    axis: "Axes", group: Group, task: str, regime: float, x: str, baselines: Sequence[Baseline], agent_line: bool
 ) -> None:
     from matplotlib.ticker import EngFormatter, MaxNLocator
 
@@ -179,19 +187,21 @@ def _draw_panel(
     for algo, (color, marker) in zip(group.algorithms, cycle(STYLES), strict=False):
         if algo in drawn:
             curve = learning_curve(drawn[algo])
-            axis.plot(curve.steps, curve.mean, color=color, marker=marker, markersize=4, linewidth=1.8, label=algo.upper())
-            axis.fill_between(curve.steps, curve.low, curve.high, color=color, **BANDS[curve.band])
+            at = getattr(curve, x)
+            axis.plot(at, curve.mean, color=color, marker=marker, markersize=4, linewidth=1.8, label=algo.upper())
+            axis.fill_between(at, curve.low, curve.high, color=color, **BANDS[curve.band])
             axis.fill_between([], [], color="0.4", **BANDS[curve.band], label=curve.band)
     first = next(iter(drawn.values()))[0]
-    last_step = max(run.final["step"] for runs in drawn.values() for run in runs)
+    last = max(getattr(run, x) for runs in drawn.values() for run in runs)
     for baseline, color in zip(baselines, cycle(BASELINE_COLORS), strict=False):
-        _draw_baseline(axis, baseline, last_step, color, first.counts_success)
-    agent_return = first.final["data"].get("mean_return")
-    if agent_line and agent_return is not None and not first.counts_success:
-        axis.axhline(agent_return, color=AGENT_COLOR, linestyle="--", linewidth=1.4, label="recorded episodes")
-    axis.set_xlim(-0.02 * last_step, 1.03 * last_step)
-    axis.xaxis.set_major_locator(MaxNLocator(5, integer=True))
-    if last_step >= 10_000:
+        _draw_baseline(axis, baseline, last, color, first.counts_success)
+    recorded = None if first.counts_success else first.final["data"].get("mean_return")
+    level = first.threshold if x == "minutes" else recorded
+    if agent_line and level is not None:
+        axis.axhline(level, color=AGENT_COLOR, linestyle="--", **X_AXES[x][1])
+    axis.set_xlim(-0.02 * last, 1.03 * last)
+    axis.xaxis.set_major_locator(MaxNLocator(5, integer=True) if x == "steps" else MaxNLocator(5, steps=[1, 2, 5, 10]))
+    if last >= 10_000:
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
 
 

@@ -1,5 +1,6 @@
 """From rows to runs: what each training run achieved, and how runs of a cell are summed up."""
 
+import math
 import os
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -14,6 +15,8 @@ PAPER_ALGORITHMS = ("dt", "dtfm")
 PAPER_REGIMES = (1.0, 0.5)
 N_LATE = 5  # evaluations in the late average
 MEASURES = {"late": "late average", "best": "best evaluation", "final": "final evaluation"}
+THRESHOLD = 0.95  # share of the scale that training takes its minutes to reach
+THRESHOLD_NAME = f"{100 * THRESHOLD:.0f} % of what was recorded"
 OVER_EPISODES, OVER_SEEDS = "95 % interval over episodes", "range over seeds"
 
 
@@ -53,17 +56,43 @@ class Run(NamedTuple):
         """
         The value on a scale common to tasks: success rate, or share of the recorded episodes' mean return.
 
-        :return: None where the recorded return is not positive or not known, or the value is not
+        :return: None where there is no scale, or no value
         """
-        value, scale = self.value(measure), 100.0 if self.counts_success else self.final["data"].get("mean_return")
-        if value is None or not isinstance(scale, float | int) or scale <= 0:
-            return None
-        return value / scale
+        value, scale = self.value(measure), self.scale
+        return None if value is None or scale is None else value / scale
+
+    @property
+    def scale(self) -> float | None:
+        """What scores 1: 100 percent success, or the recorded mean return; None where that is not positive or not known."""
+        scale = 100.0 if self.counts_success else self.final["data"].get("mean_return")
+        return scale if isinstance(scale, float | int) and scale > 0 else None
+
+    @property
+    def threshold(self) -> float | None:
+        """95 % of the scale: success in percent, or mean return in reward units; None where there is no scale."""
+        return None if self.scale is None else THRESHOLD * self.scale
+
+    @property
+    def steps(self) -> int:
+        """Gradient steps of training."""
+        return self.final["step"]
 
     @property
     def minutes(self) -> float:
         """Training time without evaluations."""
         return self.final["wall_s"] / 60
+
+    @property
+    def minutes_to_threshold(self) -> float | None:
+        """
+        Minutes of training until an evaluation, the final one included, is first at the threshold or above.
+
+        :return: inf where none is; None where there is no threshold
+        """
+        if self.threshold is None:
+            return None
+        rows = [*self.evaluations, self.final]
+        return next((row["wall_s"] / 60 for row in rows if row_value(row) >= self.threshold), math.inf)
 
     @property
     def commit(self) -> str:
@@ -73,9 +102,19 @@ class Run(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """Gradient steps (E,), the mean over runs (E,), the limits of a band around it (E,), and what the band is."""
+    """
+    A learning curve of several runs.
+
+    :param steps: gradient steps (E,)
+    :param minutes: of training until then, mean over runs (E,)
+    :param mean: over runs, success in percent or return in reward units (E,)
+    :param low: limit of a band around it (E,)
+    :param high: the other limit (E,)
+    :param band: what the band is
+    """
 
     steps: np.ndarray
+    minutes: np.ndarray
     mean: np.ndarray
     low: np.ndarray
     high: np.ndarray
@@ -84,7 +123,7 @@ class Curve(NamedTuple):
 
 class Group(NamedTuple):
     """
-    All runs of one profile and label in a study: one table, one figure.
+    All runs of one profile and label in a study: one part of the report.
 
     :param profile: name of the settings
     :param label: name of what else was changed
@@ -253,9 +292,10 @@ def learning_curve(runs: Sequence[Run]) -> Curve:
             interval = _pooled_success(rows)
         else:
             interval = student_t(rows[0]["returns"])
-        points.append((float(np.mean(values)), interval.low, interval.high))
-    mean, low, high = np.array(points, float).reshape(-1, 3).T
-    return Curve(np.array(steps, int), mean, low, high, OVER_SEEDS if several else OVER_EPISODES)
+        seconds = np.mean([row["wall_s"] for row in rows])
+        points.append((seconds / 60, np.mean(values), interval.low, interval.high))
+    minutes, mean, low, high = np.array(points, float).reshape(-1, 4).T
+    return Curve(np.array(steps, int), minutes, mean, low, high, OVER_SEEDS if several else OVER_EPISODES)
 
 
 def paired_scores(

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -9,6 +10,8 @@ from sb3_dtfm.benchmark.report.changes import changed_settings, compared_cells, 
 from sb3_dtfm.benchmark.report.runs import (
     MEASURES,
     N_LATE,
+    THRESHOLD,
+    THRESHOLD_NAME,
     Group,
     Run,
     Study,
@@ -35,6 +38,16 @@ CAPTION = (
 SOLVED_CAPTION = (
     "Share of the final episodes, of all seeds, that had succeeded by an environment step, and the median of it."
 )
+MINUTES_CAPTION = (
+    "The same evaluations against minutes of training, without the evaluations' own: means over seeds at each gradient "
+    f"step. The thin line is {THRESHOLD_NAME}."
+)
+TO_THRESHOLD = f"minutes to {100 * THRESHOLD:.0f} %"
+TO_THRESHOLD_IS = (
+    f"{TO_THRESHOLD.capitalize()}: of training, until an evaluation (the final one counts too) is first at or above "
+    f"{THRESHOLD_NAME}, a mean return, or success of 100 %. Mean over the seeds that got there; no finer than evaluations "
+    "are apart. Compare only minutes of the same machine."
+)
 
 Say = Callable[[list[Run]], str]
 
@@ -44,7 +57,8 @@ def make_report(studies: Sequence[Study], figures: Mapping[tuple[str, str], Sequ
     The whole report.
 
     :param studies: what to report on, in this order
-    :param figures: file names by study and title of a group: of its learning curves, and of its successes by step if any
+    :param figures: file names by study and title of a group: of its learning curves by gradient step and by minutes, and of
+        its successes by environment step if any
     :return: Markdown
     """
     parts = ["# DT and DTFM compared", ""]
@@ -62,13 +76,13 @@ def make_report(studies: Sequence[Study], figures: Mapping[tuple[str, str], Sequ
 
 
 def _group(group: Group, figures: Sequence[str]) -> list[str]:
-    curves, *solved = figures
+    curves, minutes, *solved = figures
     parts = [f"![learning curves]({curves})", "", CAPTION, "", *_achieved(group), "", *_intervals(group), ""]
     for file in solved:
         parts += [f"![episodes solved by environment step]({file})", "", SOLVED_CAPTION, "", *_steps(group), ""]
-    for part in (_scores, _aggregates, _time, _sources):
-        parts += [*part(group), ""]
-    return parts
+    parts += [*_scores(group), "", *_aggregates(group), ""]
+    parts += [f"![learning curves by minutes of training]({minutes})", "", MINUTES_CAPTION, "", *_time(group), ""]
+    return [*parts, *_sources(group), ""]
 
 
 def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
@@ -103,14 +117,16 @@ def _achieved(group: Group) -> list[str]:
         f"Mean ± standard deviation over seeds: success in percent, or mean return. The late average is the mean of the "
         f"last {N_LATE} evaluations of a run. Seeds of {' / '.join(map(str.upper, group.algorithms))}."
     )
-    columns = {name: lambda runs, measure=measure: _mean_and_deviation(runs, measure) for measure, name in MEASURES.items()}
+    columns = _say_measures(*MEASURES)
     seeds = ("seeds", lambda runs: " / ".join(str(len(each)) for each in runs))
     return [text, "", *_cell_table(group, group.tasks, columns, seeds)]
 
 
+def _say_measures(*measures: str) -> dict[str, Say]:
+    return {MEASURES[each]: partial(_mean_and_deviation, measure=each) for each in measures}
+
+
 def _mean_and_deviation(runs: Sequence[Run], measure: str) -> str:
-    if not runs:
-        return NOT_RUN
     found = spread(runs, measure)
     if found is None:
         return NONE
@@ -196,13 +212,9 @@ def _share(runs: Sequence[Run], measure: str) -> str:
 
 def _scale(runs_of_all: Sequence[Sequence[Run]]) -> str:
     """The returns that count as 1, and whose they are."""
-    data = [run.final["data"] for runs in runs_of_all for run in runs]
-    scales = dict.fromkeys((each.get("mean_return"), each.get("recorded_from", "not named")) for each in data)
-    named = [
-        f"{_number(mean_return)} ({_escape(source)})"
-        for mean_return, source in scales
-        if isinstance(mean_return, float | int) and mean_return > 0
-    ]
+    runs = [run for each in runs_of_all for run in each]
+    scales = dict.fromkeys((run.scale, run.final["data"].get("recorded_from", "not named")) for run in runs)
+    named = [f"{_number(scale)} ({_escape(source)})" for scale, source in scales if scale is not None]
     return "; ".join(named) or NONE
 
 
@@ -253,41 +265,48 @@ def _count(n: int, noun: str) -> str:
 
 
 def _time(group: Group) -> list[str]:
-    text = (
-        "Wall-clock time of training without evaluations, mean over seeds; the last columns are success (or the share of "
-        "the recorded return) of the final evaluation, in percent, for each minute of training. Compare only what ran on "
-        "the same machine."
-    )
+    text = f"Wall-clock time of training without evaluations, mean over seeds. {TO_THRESHOLD_IS}"
     columns: dict[str, Say] = {
-        "minutes": lambda runs: f"{np.mean([run.minutes for run in runs]):.1f}",
+        "minutes": _minutes,
         "steps/s": lambda runs: f"{np.mean([run.final['steps_per_s'] for run in runs]):.1f}",
-        "score (%) per minute": _pace,
+        TO_THRESHOLD: _minutes_to_threshold,
     }
     return [text, "", *_cell_table(group, group.tasks, columns)]
 
 
-def _pace(runs: Sequence[Run]) -> str:
-    paces = [100.0 * score / run.minutes for run in runs if (score := run.score("final")) is not None and run.minutes > 0]
-    return f"{np.mean(paces):.1f}" if paces else NONE
+def _minutes(runs: Sequence[Run]) -> str:
+    return f"{np.mean([run.minutes for run in runs]):.1f}"
+
+
+def _minutes_to_threshold(runs: Sequence[Run]) -> str:
+    minutes = [each for run in runs if (each := run.minutes_to_threshold) is not None]
+    reached = [each for each in minutes if math.isfinite(each)]
+    if not reached:
+        return "not reached" if minutes else NONE
+    seeds = "" if len(reached) == len(minutes) else f" ({len(reached)} of {_count(len(minutes), 'seed')})"
+    return f"{np.mean(reached):.2f}{seeds}"
 
 
 def _changes(base: Group, labelled: Sequence[Group]) -> list[str]:
+    columns: dict[str, Say] = {
+        **_say_measures("late", "final"),
+        "minutes": _minutes,
+        TO_THRESHOLD: _minutes_to_threshold,
+        "commit": _commits,
+    }
     rows = []
     for group in labelled:
         for task, regime, algo, runs, same in compared_cells(base, group):
             settings = _escape(changed_settings(runs[0], base.of(task, regime, algo)))
-            results = [_mean_and_deviation(each, measure) for measure in ("late", "final") for each in (runs, same)]
-            minutes = f"{np.mean([run.minutes for run in runs]):.1f}"
-            cell = [group.label, settings or NONE, task, f"{regime:.0%}", algo.upper()]
-            rows.append([*cell, *results, str(len(runs)), minutes, _commits(runs), _commits(same)])
-    measures = [f"{MEASURES[measure]}{which}" for measure in ("late", "final") for which in ("", " without")]
+            cells = [say(each) if each else NOT_RUN for say in columns.values() for each in (runs, same)]
+            rows.append([group.label, settings or NONE, task, f"{regime:.0%}", algo.upper(), *cells, str(len(runs))])
     text = (
         "What a label's settings did, beside the runs without it of the same seeds: mean ± standard deviation over seeds, "
-        "success in percent or mean return; minutes of training; commits of the code that trained them. Where these differ, "
-        "so may the code."
+        "success in percent or mean return; minutes of training without evaluations; commits of the code that trained them. "
+        f"Where these differ, so may the code. {TO_THRESHOLD_IS}"
     )
-    header = ["label", "settings", "task", "data", "algorithm", *measures, "seeds", "minutes", "commit", "commit without"]
-    return [text, "", *_table(header, rows)]
+    compared = [f"{name}{which}" for name in columns for which in ("", " without")]
+    return [text, "", *_table(["label", "settings", "task", "data", "algorithm", *compared, "seeds"], rows)]
 
 
 def _commits(runs: Sequence[Run]) -> str:
