@@ -20,8 +20,8 @@ from sb3_dtfm.networks.solvers import SOLVERS, integrate, solver_times
 ONE_STEP = "one_step"
 # Solver steps whose end that network learns.
 DISTILLED_STEPS = 16
-# Newest steps of each window that it learns from: where acting asks it, and few enough to cost little.
-ONE_STEP_POSITIONS = 4
+# Values of tau in a window, which its steps take in turn: the share of tau in scales and shifts is computed once for each.
+TAUS_PER_WINDOW = 4
 
 OPTIONS: dict[str, Rule] = {
     "flow_hidden_dim": COUNT,
@@ -45,6 +45,11 @@ def interpolate(noise: th.Tensor, action: th.Tensor, tau: th.Tensor) -> tuple[th
     """
     velocity = action - noise
     return noise + tau * velocity, velocity
+
+
+def in_turn(values: th.Tensor, context_length: int) -> th.Tensor:
+    """From N values a window, (B, N, ...), to one a step, (B, K, ...), over and over."""
+    return values.repeat(1, -(-context_length // values.shape[1]), 1)[:, :context_length]
 
 
 class FlowHead(ActionHead):
@@ -114,9 +119,12 @@ class FlowHead(ActionHead):
         return choices
 
     def draw_noise(self, actions: th.Tensor, generator: th.Generator) -> tuple[th.Tensor, ...]:
+        batch_size, context_length = actions.shape[:2]
         noise = th.randn(actions.shape, generator=generator, device=actions.device)
-        tau = th.rand(actions.shape[:2], generator=generator, device=actions.device) ** self.flow_tau_exponent
-        return noise, tau
+        start = th.rand((), generator=generator, device=actions.device)
+        rows = th.linspace(0, 1, batch_size + 1, device=actions.device)[:-1, None]
+        turns = th.linspace(0, 1, TAUS_PER_WINDOW + 1, device=actions.device)[:-1]
+        return noise, (start + rows + turns)[:, :context_length].remainder(1.0) ** self.flow_tau_exponent
 
     def loss(
         self, hidden: th.Tensor, actions: th.Tensor, mask: th.Tensor, *noise: th.Tensor
@@ -128,8 +136,7 @@ class FlowHead(ActionHead):
             regression_loss, auxiliary_parts = self.auxiliary.loss(hidden, actions, mask)
             loss, parts = loss + self.regression_coef * regression_loss, {**parts, **auxiliary_parts}
         if self.one_step is not None:
-            newest = slice(-ONE_STEP_POSITIONS, None)
-            parts["one_step_loss"] = self.one_step_loss(hidden[:, newest], mask[:, newest], starts[:, newest])
+            parts["one_step_loss"] = self.one_step_loss(hidden[:, -1], mask[:, -1], starts[:, -1])
             loss = loss + parts["one_step_loss"]
         return loss, parts
 
@@ -145,11 +152,12 @@ class FlowHead(ActionHead):
         :param actions: (B, K, A) in [-1, 1]
         :param mask: (B, K) bool
         :param noise: (B, K, A), standard normal
-        :param tau: (B, K) in [0, 1]
+        :param tau: (B, N) in [0, 1], which the steps take in turn
         :return: mean squared error over valid steps
         """
-        x, velocity = interpolate(noise, actions, tau.unsqueeze(-1))
-        output = self.vector_field(x, self.vector_field.film_condition(hidden) + self.vector_field.time_share(tau))
+        x, velocity = interpolate(noise, actions, in_turn(tau.unsqueeze(-1), actions.shape[1]))
+        time_share = in_turn(self.vector_field.time_share(tau), actions.shape[1])
+        output = self.vector_field(x, self.vector_field.film_condition(hidden) + time_share)
         error = output - velocity if self.regression is None else (self.regression(hidden) + output).tanh() - actions
         return masked_mean(error.square(), mask)
 
@@ -157,9 +165,9 @@ class FlowHead(ActionHead):
         """
         Distillation (Luhman and Luhman, 2021): squared error against where the solver ends, from the same noise.
 
-        :param hidden: (B, K, D); no gradient flows into it
-        :param mask: (B, K) bool
-        :param noise: (B, K, A), standard normal
+        :param hidden: (..., D); no gradient flows into it
+        :param mask: (...) bool
+        :param noise: (..., A), standard normal
         :return: mean squared error over valid steps
         """
         hidden = hidden.detach()
@@ -208,7 +216,7 @@ class FlowHead(ActionHead):
         return integrate(field, noise, solver, n_solver_steps)
 
     def part_masks(self, mask: th.Tensor) -> dict[str, th.Tensor]:
-        return {"one_step_loss": mask[:, -ONE_STEP_POSITIONS:]} if self.one_step is not None else {}
+        return {"one_step_loss": mask[:, -1]} if self.one_step is not None else {}
 
     def unclipped_parameters(self) -> list[nn.Parameter]:
         """The one-step network's: it must not change how the others are clipped."""

@@ -50,9 +50,9 @@ class FilmNetwork(nn.Module):
         :param film: (..., 2 * hidden_dim * n_layers), scales and shifts: `film_condition(h)` and what is added to it
         :return: (..., A)
         """
-        for layer, layer_film in zip(self.layers, film.chunk(self.n_layers, dim=-1), strict=True):
-            scale, shift = layer_film.chunk(2, dim=-1)
-            x = F.silu(layer(x) * (1.0 + scale) + shift)
+        scales_and_shifts = film.chunk(2 * self.n_layers, dim=-1)
+        for layer, scale, shift in zip(self.layers, scales_and_shifts[::2], scales_and_shifts[1::2], strict=True):
+            x = F.silu(th.addcmul(shift, layer(x), 1.0 + scale))
         return self.output(x)
 
 

@@ -5,7 +5,7 @@ import torch as th
 from torch import nn
 
 from sb3_dtfm.heads import FlowHead, RegressionHead
-from sb3_dtfm.heads.flow import interpolate
+from sb3_dtfm.heads.flow import in_turn, interpolate
 from sb3_dtfm.networks.solvers import SOLVERS
 
 PREDICTIONS = ("velocity", "action")
@@ -54,6 +54,21 @@ def test_the_loss_is_the_mean_over_valid_steps(prediction):
             error = (head.regression(hidden[row, step]) + output).tanh() - actions[row, step]
         by_hand.append(error.square().mean())
     th.testing.assert_close(head.flow_loss(hidden, actions, mask, noise, tau), th.stack(by_hand).mean())
+
+
+def test_taus_are_spread_evenly_from_a_random_start_and_taken_in_turn():
+    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8)
+    generator = th.Generator().manual_seed(0)
+    noise, tau = head.draw_noise(th.zeros(50, 20, 2), generator)
+    assert (noise.shape, tau.shape) == ((50, 20, 2), (50, 4))
+    assert tau.flatten().sort().values.diff().max() <= 1 / 50 + 1e-6
+    th.testing.assert_close((tau - tau[:, :1]).remainder(1.0), th.tensor([0.0, 0.25, 0.5, 0.75]).expand(50, 4))
+    starts = th.cat([head.draw_noise(th.zeros(1, 1, 2), generator)[1] for _ in range(2000)])
+    assert starts.mean() == pytest.approx(0.5, abs=0.03)
+    assert 0.0 <= starts.min() < 0.01 < 0.99 < starts.max() <= 1.0
+    tau = tau.unsqueeze(-1)
+    assert in_turn(tau, 6).equal(tau[:, [0, 1, 2, 3, 0, 1]])
+    assert in_turn(tau, 3).equal(tau[:, :3])
 
 
 @pytest.mark.parametrize("n_solver_steps", [1, 3, 50])
