@@ -20,12 +20,17 @@ from torch.utils.flop_counter import FlopCounterMode
 from worker import BATCH_SIZE, CONTEXT_LENGTH, make_model
 
 HERE = Path(__file__).parent
-SIZES = {"width 128, 3 layers": (128, 3, 15), "width 256, 10 layers": (256, 10, 5)}
+# Name: width, layers, width of the flow head (512 by default, 256 in the small profile), gradient steps to measure.
+SIZES = {
+    "width 128, 3 layers, head 256": (128, 3, 256, 15),
+    "width 128, 3 layers, head 512": (128, 3, 512, 15),
+    "width 256, 10 layers, head 512": (256, 10, 512, 5),
+}
 N_ACTIONS = 100
+TOKENS = (3, 1)
 # Name: solver, its steps, keys and values kept, environments, time step of the first action.
 ACTING = {
     "50 Euler steps": ("euler", 50, 0, 1, 0),
-    "10 Euler steps": ("euler", 10, 0, 1, 0),
     "one step": ("one_step", 1, 0, 1, 0),
     "50 Euler steps, kv_cache": ("euler", 50, 1, 1, 0),
     "10 Euler steps, kv_cache": ("euler", 10, 1, 1, 0),
@@ -33,7 +38,6 @@ ACTING = {
     "one step, kv_cache, from time step 10,000": ("one_step", 1, 1, 1, 10_000),
     "50 Euler steps, kv_cache, 16 environments": ("euler", 50, 1, 16, 0),
     "one step, kv_cache, 16 environments": ("one_step", 1, 1, 16, 0),
-    "one step, 16 environments": ("one_step", 1, 0, 16, 0),
 }
 
 
@@ -51,9 +55,9 @@ def medians(runs: list[dict[str, float]]) -> dict[str, float]:
     return {key: statistics.median(run[key] for run in runs) for key in runs[0] if not isinstance(runs[0][key], str)}
 
 
-def matrix_flops(width: int, n_layers: int) -> float:
+def matrix_flops(width: int, n_layers: int, flow_hidden_dim: int, tokens_per_step: int) -> float:
     """Floating-point operations of one gradient step's matrix products, counted by torch."""
-    model = make_model(width, n_layers)
+    model = make_model("dtfm", width, n_layers, flow_hidden_dim, tokens_per_step)
     model.policy.set_training_mode(True)
     generator = th.Generator().manual_seed(0)
     batch = model.buffer.sample(BATCH_SIZE, CONTEXT_LENGTH, generator)
@@ -75,38 +79,56 @@ def matrix_rate() -> float:
 
 
 def training_table(peer_python: str, repeats: int) -> None:
-    print("| training | d3rlpy DT, ms | DTFM, ms | d3rlpy / DTFM | bound, ms | of the bound | sampling | peak MiB, both |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for name, (width, n_layers, n_steps) in SIZES.items():
-        peers, ours, rates = [], [], []
+    """DT and DTFM, each with three tokens a step and with one, in turn with the peer."""
+    print(
+        "| training | tokens | d3rlpy DT, ms | DT, ms | DTFM, ms | d3rlpy / DT | / DTFM | head | bound, ms | sampling | MiB |"
+    )
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    ours = tuple((algo, tokens) for tokens in TOKENS for algo in ("dt", "dtfm"))
+    for name, (*size, n_steps) in SIZES.items():
+        peers, rates = [], []
+        runs: dict[tuple[str, int], list[dict[str, float]]] = {each: [] for each in ours}
         for _ in range(repeats):
             rates.append(matrix_rate())
-            peers.append(measure(peer_python, "d3rlpy_worker.py", "train", width, n_layers, n_steps))
-            ours.append(measure(sys.executable, "worker.py", "train", width, n_layers, n_steps))
-        peer, our = medians(peers), medians(ours)
-        bound = matrix_flops(width, n_layers) / statistics.median(rates) * 1e3
-        print(
-            f"| {name} | {peer['wall_ms']:.0f} | {our['wall_ms']:.0f} | {peer['wall_ms'] / our['wall_ms']:.2f} "
-            f"| {bound:.0f} | {bound / our['wall_ms']:.0%} | {our['sampling_ms'] / our['wall_ms']:.1%} "
-            f"| {peer['peak_mib']:.0f}, {our['peak_mib']:.0f} |",
-            flush=True,
-        )
+            peers.append(measure(peer_python, "d3rlpy_worker.py", "train", *size[:2], n_steps))
+            for algo, tokens in ours:
+                runs[algo, tokens].append(measure(sys.executable, "worker.py", "train", algo, *size, tokens, n_steps))
+        peer = medians(peers)
+        for tokens in TOKENS:
+            dt, dtfm = (medians(runs[algo, tokens]) for algo in ("dt", "dtfm"))
+            bound = matrix_flops(*size, tokens) / statistics.median(rates) * 1e3
+            print(
+                f"| {name} | {tokens} | {peer['wall_ms']:.0f} | {dt['wall_ms']:.0f} | {dtfm['wall_ms']:.0f} "
+                f"| {peer['wall_ms'] / dt['wall_ms']:.2f} | {peer['wall_ms'] / dtfm['wall_ms']:.2f} "
+                f"| {1 - dt['wall_ms'] / dtfm['wall_ms']:.0%} | {bound:.0f} | {dtfm['sampling_ms'] / dtfm['wall_ms']:.1%} "
+                f"| {peer['peak_mib']:.0f}, {dtfm['peak_mib']:.0f} |",
+                flush=True,
+            )
     print(
-        f"\nBound: matrix products alone, at the {statistics.median(rates) / 1e9:.0f} GFLOP/s of a large float32 product.\n"
+        "\nHead: what DTFM takes longer than DT, as a share of its step. Bound: DTFM's matrix products alone, at the "
+        f"{statistics.median(rates) / 1e9:.0f} GFLOP/s of a large float32 product. MiB: peak of d3rlpy's process, and of DTFM's.\n"
     )
 
 
 def acting_table(peer_python: str, repeats: int) -> None:
-    print("| acting, width 256, 10 layers | ms | of d3rlpy's |")
-    print("| --- | --- | --- |")
-    runs: dict[str, list[dict[str, float]]] = {name: [] for name in ("d3rlpy DT", *ACTING)}
+    """DTFM's ways of acting, with three tokens a step and with one, in turn with the peer."""
+    print("| acting, width 256, 10 layers | 3 tokens, ms | 1 token, ms | 3 tokens, of d3rlpy's | 1 token, of d3rlpy's |")
+    print("| --- | --- | --- | --- | --- |")
+    ours = tuple((name, tokens) for name in ACTING for tokens in TOKENS)
+    peers: list[dict[str, float]] = []
+    runs: dict[tuple[str, int], list[dict[str, float]]] = {each: [] for each in ours}
     for _ in range(repeats):
-        runs["d3rlpy DT"].append(measure(peer_python, "d3rlpy_worker.py", "act", 256, 10, N_ACTIONS))
-        for name, setting in ACTING.items():
-            runs[name].append(measure(sys.executable, "worker.py", "act", 256, 10, N_ACTIONS, *setting))
-    times = {name: medians(results)["wall_ms"] for name, results in runs.items()}
-    for name, milliseconds in times.items():
-        print(f"| {name} | {milliseconds:.1f} | {milliseconds / times['d3rlpy DT']:.2f} |")
+        peers.append(measure(peer_python, "d3rlpy_worker.py", "act", 256, 10, N_ACTIONS))
+        for name, tokens in ours:
+            runs[name, tokens].append(
+                measure(sys.executable, "worker.py", "act", "dtfm", 256, 10, 512, tokens, N_ACTIONS, *ACTING[name])
+            )
+    peer = medians(peers)["wall_ms"]
+    print(f"| d3rlpy DT | {peer:.1f} | | 1.00 | |")
+    for name in ACTING:
+        times = [medians(runs[name, tokens])["wall_ms"] for tokens in TOKENS]
+        cells = [f"{each:.1f}" for each in times] + [f"{each / peer:.2f}" for each in times]
+        print(f"| {name} | {' | '.join(cells)} |")
 
 
 def main() -> None:

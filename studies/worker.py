@@ -1,8 +1,8 @@
 """
-Measure DTFM; run by `compare.py`, each measurement in a process of its own.
+Measure DT or DTFM; run by `compare.py`, each measurement in a process of its own.
 
-`python worker.py train WIDTH LAYERS N` or `python worker.py act WIDTH LAYERS N SOLVER SOLVER_STEPS KV_CACHE N_ENVS FIRST`
-prints one line of JSON.
+`python worker.py train MODEL N` or `python worker.py act MODEL N SOLVER SOLVER_STEPS KV_CACHE N_ENVS FIRST` prints one line
+of JSON; MODEL is ALGO WIDTH LAYERS FLOW_HIDDEN_DIM TOKENS_PER_STEP.
 """
 
 import json
@@ -17,35 +17,37 @@ import torch as th
 from gymnasium import spaces
 
 import sb3_dtfm
-from sb3_dtfm import DTFM
+from sb3_dtfm.algorithms import ALGORITHMS, OfflineSequenceAlgorithm
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 
 OBSERVATION_DIM, ACTION_DIM, BATCH_SIZE, CONTEXT_LENGTH = 17, 6, 64, 20
 
 
-def make_model(width: int, n_layers: int, **policy_kwargs: object) -> DTFM:
-    """DTFM at its defaults but for the size; the flow head of the small profile is half as wide."""
+def make_model(
+    algo: str, width: int, n_layers: int, flow_hidden_dim: int, tokens_per_step: int, **policy_kwargs: object
+) -> OfflineSequenceAlgorithm:
+    """DT or DTFM at its defaults but for the size and what is given."""
     rng = np.random.default_rng(0)
     episodes = [
         Trajectory(rng.normal(size=(1000, OBSERVATION_DIM)), rng.uniform(-1, 1, (1000, ACTION_DIM)), rng.normal(size=1000))
         for _ in range(10)
     ]
     dataset = TrajectoryBuffer.from_trajectories(episodes, spaces.Box(-1, 1, (ACTION_DIM,)))
-    sizes = dict(embed_dim=width, n_layers=n_layers, flow_hidden_dim=2 * width)
-    return DTFM(
+    sizes = dict(embed_dim=width, n_layers=n_layers, tokens_per_step=tokens_per_step)
+    head = dict(flow_hidden_dim=flow_hidden_dim) if algo == "dtfm" else {}
+    return ALGORITHMS[algo](
         "MultiInputPolicy",
         dataset=dataset,
         batch_size=BATCH_SIZE,
         context_length=CONTEXT_LENGTH,
-        policy_kwargs={**sizes, **policy_kwargs},
+        policy_kwargs={**sizes, **head, **policy_kwargs},
         device="cpu",
         seed=0,
     )
 
 
-def train(width: int, n_layers: int, n_steps: int) -> dict[str, float]:
-    """Median of the time between two steps of `learn`, its sampling included, and the share of the sampling."""
-    model = make_model(width, n_layers)
+def train(model: OfflineSequenceAlgorithm, n_steps: int) -> dict[str, float]:
+    """Median of the time between two steps of `learn`, its sampling included, and the time of the sampling."""
     stamps = []
     model.learn(
         n_steps + 2,
@@ -58,11 +60,8 @@ def train(width: int, n_layers: int, n_steps: int) -> dict[str, float]:
     return {"wall_ms": wall, "processor_ms": processor, "sampling_ms": sampling}
 
 
-def act(
-    width: int, n_layers: int, n: int, solver: str, n_solver_steps: int, kv_cache: bool, n_envs: int, first: int
-) -> dict[str, float]:
+def act(model: OfflineSequenceAlgorithm, n: int, n_envs: int, first: int) -> dict[str, float]:
     """Median time of `predict` with a full context, in episodes seen from time step `first` on."""
-    model = make_model(width, n_layers, solver=solver, n_solver_steps=n_solver_steps, kv_cache=kv_cache)
     rng = np.random.default_rng(0)
     state, times = None, []
     for t in range(CONTEXT_LENGTH + n):
@@ -88,12 +87,14 @@ def median_ms(function: Callable[[], object], n: int) -> float:
 
 
 def main() -> None:
-    what, width, n_layers, n = sys.argv[1], *map(int, sys.argv[2:5])
+    what, algo, *numbers = sys.argv[1:8]
+    *sizes, n = map(int, numbers)
     if what == "train":
-        result = train(width, n_layers, n)
+        result = train(make_model(algo, *sizes), n)
     else:
-        solver, n_solver_steps, kv_cache, n_envs, first = sys.argv[5], *map(int, sys.argv[6:10])
-        result = act(width, n_layers, n, solver, n_solver_steps, bool(kv_cache), n_envs, first)
+        solver, n_solver_steps, kv_cache, n_envs, first = sys.argv[8], *map(int, sys.argv[9:13])
+        ways = dict(solver=solver, n_solver_steps=n_solver_steps, kv_cache=bool(kv_cache))
+        result = act(make_model(algo, *sizes, **ways), n, n_envs, first)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(json.dumps({**result, "peak_mib": peak, "version": sb3_dtfm.__version__, "torch": th.__version__}))
 
