@@ -81,7 +81,7 @@ def matrix_rate() -> float:
 def training_table(peer_python: str, repeats: int) -> None:
     """DT and DTFM, each with three tokens a step and with one, in turn with the peer."""
     print(
-        "| training | tokens | d3rlpy DT, ms | DT, ms | DTFM, ms | d3rlpy / DT | / DTFM | head | bound, ms | sampling | MiB |"
+        "| training | tokens | d3rlpy DT, ms | DT, ms | DTFM, ms | d3rlpy / DT | / DTFM | head | bound, ms | drawing | MiB |"
     )
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     ours = tuple((algo, tokens) for tokens in TOKENS for algo in ("dt", "dtfm"))
@@ -106,7 +106,7 @@ def training_table(peer_python: str, repeats: int) -> None:
             )
     print(
         "\nHead: what DTFM takes longer than DT, as a share of its step. Bound: DTFM's matrix products alone, at the "
-        f"{statistics.median(rates) / 1e9:.0f} GFLOP/s of a large float32 product. MiB: peak of d3rlpy's process, and of DTFM's.\n"
+        f"{statistics.median(rates) / 1e9:.0f} GFLOP/s of a large float32 product. MiB: peaks of d3rlpy and DTFM.\n"
     )
 
 
