@@ -28,9 +28,13 @@ class OperationsOnTheCpu(TorchDispatchMode):
 
 @pytest.mark.parametrize("algorithm", [DT, DTFM])
 @pytest.mark.parametrize("flow_prediction", ["velocity", "action"])
-def test_a_gradient_step_makes_nothing_on_the_cpu_for_another_device(algorithm, flow_prediction, cheetah_buffer):
+@pytest.mark.parametrize("tokens_per_step", [3, 1])
+def test_a_gradient_step_makes_nothing_on_the_cpu_for_another_device(
+    algorithm, flow_prediction, tokens_per_step, cheetah_buffer
+):
     """A number that moves from the CPU holds the GPU's queue up. PyTorch's "meta" device computes shapes alone."""
     policy_kwargs = {"flow_prediction": flow_prediction} if algorithm is DTFM else {}
+    policy_kwargs["tokens_per_step"] = tokens_per_step
     policy = make_model(algorithm, cheetah_buffer, precision="float32", policy_kwargs=policy_kwargs).policy.to("meta")
     policy.set_training_mode(True)
     batch = cheetah_buffer.sample(4, 5, th.Generator().manual_seed(0))
