@@ -43,7 +43,7 @@ def benchmark_parser() -> argparse.ArgumentParser:
     grid("--profile", default="small", help="small (default), paper, a YAML file, or a folder with dt.yml and dtfm.yml")
     grid("--label", default="", help="name of what -params change; part of a cell's identity")
     data = parser.add_argument_group("data").add_argument
-    data("--dataset", **several, metavar="TASK=DATASET", help="Minari id or robomimic file")
+    data("--dataset", **several, metavar="TASK=DATASET", help="Minari id, robomimic or .npz file")
     data("--datasets", metavar="FILE", help="YAML file that says the same for many tasks, see below")
     data("--dataset-cache", metavar="DIR", help="learn from memory-mapped files made in this folder")
     data("--target-return", **several, metavar="[TASK=]RETURN", help="to ask for when acting, in reward units")

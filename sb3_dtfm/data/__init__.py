@@ -3,6 +3,7 @@
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.episodes import Statistics
 from sb3_dtfm.data.minari import load_minari
+from sb3_dtfm.data.npz import load_npz
 from sb3_dtfm.data.readers import load_dataset
 from sb3_dtfm.data.robomimic import load_robomimic
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, check_action_space, returns_to_go
@@ -16,6 +17,7 @@ __all__ = [
     "check_action_space",
     "load_dataset",
     "load_minari",
+    "load_npz",
     "load_robomimic",
     "returns_to_go",
 ]

@@ -12,6 +12,7 @@ from minari import MinariDataset
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, load_cached
 from sb3_dtfm.data.minari import fingerprint_minari, is_minari, load_minari
+from sb3_dtfm.data.npz import fingerprint_npz, is_npz, load_npz
 from sb3_dtfm.data.robomimic import fingerprint_robomimic, is_robomimic, load_robomimic
 from sb3_dtfm.data.trajectories import DatasetError
 
@@ -34,6 +35,7 @@ class Reader(NamedTuple):
 
 # The first one that accepts a dataset reads it.
 READERS = (
+    Reader("the path of a file of flat arrays (.npz)", is_npz, load_npz, fingerprint_npz),
     Reader("the path of a robomimic file (.hdf5)", is_robomimic, load_robomimic, fingerprint_robomimic),
     Reader("a Minari id (namespace/name-vN) or MinariDataset", is_minari, load_minari, fingerprint_minari),
     Reader("a TrajectoryBuffer", lambda dataset: isinstance(dataset, TrajectoryBuffer), lambda dataset: dataset, None),
@@ -49,12 +51,12 @@ def load_dataset(
     """
     Read recorded episodes from wherever they are.
 
-    :param dataset: a Minari id (`namespace/name-vN`), an opened Minari dataset, the path of a robomimic hdf5 file, or a
-        buffer, which is returned as it is
+    :param dataset: a Minari id (`namespace/name-vN`), an opened Minari dataset, the path of a robomimic hdf5 file or
+        of flat arrays (`.npz`), or a buffer, which is returned as it is
     :param cache_dir: learn from memory-mapped files in this folder, for datasets larger than memory; they are written at
         the first call and whenever the dataset has changed. None reads everything into memory
     :param env_id: Gymnasium id of the environment that the episodes count as coming from, whatever the dataset says
-    :param kwargs: options of the reader (`filter_key` and `observation_keys` for robomimic files)
+    :param kwargs: options of the reader (`filter_key` and `observation_keys` for robomimic files, see also :func:`load_npz`)
     :raises DatasetError: `dataset` is nothing of the above, its reader refuses it, or its cache cannot be used
     :raises TypeError: the reader has no such option
     """

@@ -4,7 +4,6 @@ import json
 import os
 import re
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import h5py
@@ -14,10 +13,11 @@ from gymnasium import spaces
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint
 from sb3_dtfm.data.storage import FileStorage
-from sb3_dtfm.data.trajectories import DatasetError, Trajectory
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory, existing_file
 from sb3_dtfm.envs.robosuite import env_id_from_robomimic
 
 DEFAULT_OBSERVATION_KEYS = ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos", "object")
+EXPECTED = "the path of a robomimic hdf5 file"
 HDF5_SUFFIXES = (".hdf5", ".h5")
 ALIASES = {"object": "object-state", "object-state": "object"}  # robomimic's name and robosuite's
 OLD_LAYOUT_TOLERANCE = 1e-3  # metres
@@ -39,7 +39,7 @@ def fingerprint_robomimic(path: str | os.PathLike[str], options: dict[str, Any])
     :param options: of :func:`load_robomimic`
     :raises DatasetError: no such file
     """
-    path = _existing_file(path)
+    path = existing_file(path, EXPECTED)
     return Fingerprint.of(path.name, path, options)
 
 
@@ -70,7 +70,7 @@ def load_robomimic(
     :raises DatasetError: no such file, not readable, nothing in it, unknown keys, wrong shapes, NaN or infinity, or actions
         out of range; names the file, the demonstration and the step
     """
-    path = _existing_file(path)
+    path = existing_file(path, EXPECTED)
     source = str(path)
     try:
         if not h5py.is_hdf5(path):
@@ -79,14 +79,6 @@ def load_robomimic(
             return _read(file, source, filter_key, tuple(observation_keys or DEFAULT_OBSERVATION_KEYS), storage)
     except OSError as error:
         raise DatasetError(f"{source}: cannot be read to the end ({error}); is the file cut off?") from error
-
-
-def _existing_file(path: str | os.PathLike[str]) -> Path:
-    path = Path(path).expanduser()
-    if not path.is_file():
-        problem = "is a folder" if path.is_dir() else "does not exist"
-        raise DatasetError(f"{path.absolute()} {problem}; the path of a robomimic hdf5 file is expected.")
-    return path
 
 
 def _read(

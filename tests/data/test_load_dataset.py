@@ -108,10 +108,11 @@ def test_a_further_reader_is_one_row_of_the_table(tmp_path: Path, monkeypatch: p
     def fingerprint_numpy(path: str, options: dict[str, Any]) -> Fingerprint:
         return Fingerprint.of(Path(path).name, Path(path), options)
 
-    row = readers.Reader("the path of an .npz file", lambda name: str(name).endswith(".npz"), load_numpy, fingerprint_numpy)
+    row = readers.Reader("the path of a .zip file", lambda name: str(name).endswith(".zip"), load_numpy, fingerprint_numpy)
     monkeypatch.setattr(readers, "READERS", (row, *readers.READERS))
-    path = str(tmp_path / "episode.npz")
-    np.savez(path, observations=np.zeros((3, 2)), actions=np.zeros((3, 1)), rewards=np.ones(3))
+    path = str(tmp_path / "episode.zip")
+    with open(path, "wb") as file:
+        np.savez(file, observations=np.zeros((3, 2)), actions=np.zeros((3, 1)), rewards=np.ones(3))
     for cache_dir in (None, tmp_path / "cache"):
         buffer = load_dataset(path, cache_dir=cache_dir, scale=2.0, env_id="Own-v0")
         assert (buffer.episode_returns.tolist(), buffer.env_id, buffer.memory_mapped) == (
@@ -121,7 +122,7 @@ def test_a_further_reader_is_one_row_of_the_table(tmp_path: Path, monkeypatch: p
         )
     with pytest.raises(TypeError, match="unknown option filter_key; accepted: scale, cache_dir, env_id"):
         load_dataset(path, filter_key="train")
-    with pytest.raises(DatasetError, match=r"accepted are the path of an .npz file, the path of a robomimic file"):
+    with pytest.raises(DatasetError, match=r"accepted are the path of a .zip file, the path of a file of flat arrays"):
         load_dataset("halfcheetah")
 
 
