@@ -58,7 +58,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
 
     :param policy: "MultiInputPolicy" or a policy class
     :param env: environment wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`; optional, never used for learning
-    :param dataset: Minari id or dataset, path to a robomimic hdf5 file or to `.npz` arrays, or a :class:`~sb3_dtfm.data.TrajectoryBuffer`
+    :param dataset: Minari id or dataset, path to a robomimic hdf5 file or to `.npz` arrays, or a
+        :class:`~sb3_dtfm.data.TrajectoryBuffer`
     :param learning_rate: AdamW's, a number or a function of the progress remaining (from 1 to 0)
     :param batch_size: windows in a gradient step, of all processes together
     :param weight_decay: AdamW's, on weight matrices only
