@@ -36,8 +36,9 @@ class Context(NamedTuple):
 
     Shapes: observations (B, K, O) as the environment gives them, actions (B, K, A) in [-1, 1], returns_to_go (B, K) in
     environment reward units, timesteps (B, K) int64, mask (B, K) bool, False on padded steps, episode_keys (B,) int64, a
-    hash of the bytes of each episode's first observation, keys_values (B, ...), what the policy keeps of its earlier
-    computation, (B, 0) if nothing.
+    hash of the bytes of each episode's first observation, plan (B, P, A) in [-1, 1], actions chosen for the next steps,
+    n_planned (B,) int64, how many of them are left, keys_values (B, ...), what the policy keeps of its earlier computation,
+    (B, 0) if nothing.
     """
 
     observations: np.ndarray
@@ -46,6 +47,8 @@ class Context(NamedTuple):
     timesteps: np.ndarray
     mask: np.ndarray
     episode_keys: np.ndarray
+    plan: np.ndarray
+    n_planned: np.ndarray
     keys_values: np.ndarray
 
     @property
@@ -54,7 +57,7 @@ class Context(NamedTuple):
         return Windows(*(getattr(self, name) for name in Windows._fields))
 
 
-def empty_context(n_rows: int, context_length: int, observation_dim: int, action_dim: int) -> Context:
+def empty_context(n_rows: int, context_length: int, observation_dim: int, action_dim: int, plan_length: int = 0) -> Context:
     """A context in which no row has seen a step yet."""
     return Context(
         np.zeros((n_rows, context_length, observation_dim), np.float32),
@@ -62,6 +65,8 @@ def empty_context(n_rows: int, context_length: int, observation_dim: int, action
         np.zeros((n_rows, context_length), np.float32),
         np.zeros((n_rows, context_length), np.int64),
         np.zeros((n_rows, context_length), bool),
+        np.zeros(n_rows, np.int64),
+        np.zeros((n_rows, plan_length, action_dim), np.float32),
         np.zeros(n_rows, np.int64),
         np.zeros((n_rows, 0), np.float32),
     )
@@ -106,6 +111,8 @@ def push(
         _shift(context.timesteps, timestep),
         np.concatenate((context.mask[:, 1:] & keep, np.ones_like(keep)), axis=1),
         episode_keys,
+        context.plan,
+        np.where(restart, 0, context.n_planned),
         context.keys_values,
     )
 
@@ -119,6 +126,20 @@ def with_action(context: Context, action: np.ndarray) -> Context:
     actions = context.actions.copy()
     actions[:, -1] = action
     return context._replace(actions=actions)
+
+
+def with_plan(context: Context, due: np.ndarray, chunk: np.ndarray) -> Context:
+    """
+    Take the newest step's action from the plan; where none is left, from a new one.
+
+    :param due: (B,) bool, True where the plan is used up
+    :param chunk: (number due, P + 1, A) in [-1, 1], actions for this step and the next ones
+    """
+    actions = np.zeros((len(due), *chunk.shape[1:]), np.float32)
+    actions[~due, :-1] = context.plan[~due]
+    actions[due] = chunk
+    n_planned = np.where(due, chunk.shape[1], context.n_planned) - 1
+    return with_action(context, actions[:, 0])._replace(plan=actions[:, 1:], n_planned=n_planned)
 
 
 def _shift(window: np.ndarray, newest: np.ndarray) -> np.ndarray:

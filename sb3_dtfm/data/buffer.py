@@ -257,7 +257,12 @@ class TrajectoryBuffer:
         return moved
 
     def batches(
-        self, batch_size: int, context_length: int, generator: th.Generator, timestep_exponent: float = 1.0
+        self,
+        batch_size: int,
+        context_length: int,
+        generator: th.Generator,
+        timestep_exponent: float = 1.0,
+        n_ahead: int = 0,
     ) -> Iterator[Windows]:
         """
         Endless batches of windows, each drawn before the one before it is handed out.
@@ -269,16 +274,17 @@ class TrajectoryBuffer:
         :param generator: source of randomness, of nothing else: it is a batch ahead
         :param timestep_exponent: e of the time step T u^e in an episode of T steps, for u uniform in [0, 1]; 1 draws any
             step of any episode with equal probability
+        :param n_ahead: see :meth:`windows`
         """
 
         def ends() -> Iterator[th.Tensor]:
             while True:
                 drawn = self._draw(batch_size, generator, timestep_exponent)
-                self._prefetch(drawn, context_length)
+                self._prefetch(drawn, context_length, n_ahead)
                 yield drawn
 
         for present, _ in itertools.pairwise(ends()):
-            yield self.windows(present, context_length)
+            yield self.windows(present, context_length, n_ahead)
 
     def sample(self, batch_size: int, context_length: int, generator: th.Generator | None = None) -> Windows:
         """
@@ -302,21 +308,24 @@ class TrajectoryBuffer:
         timesteps = ((lasts + 1 - firsts) * u**timestep_exponent).long()
         return th.minimum(firsts + timesteps, lasts)  # a product may round to T
 
-    def _prefetch(self, ends: th.Tensor, context_length: int) -> None:
+    def _prefetch(self, ends: th.Tensor, context_length: int, n_ahead: int) -> None:
         """Start to read windows from disk, if that is where they are, so that :meth:`windows` need not wait for them."""
         if self.memory_mapped:
-            stops = (self._locate(ends)[0] + 1).tolist()
+            rows, _, n_left = self._locate(ends)
+            stops = (rows + n_left.clamp(max=n_ahead) + 1).tolist()
             for steps in self._maps:
-                steps.will_need(stops, context_length)
+                steps.will_need(stops, context_length + n_ahead)
 
-    def windows(self, ends: th.Tensor, context_length: int) -> Windows:
+    def windows(self, ends: th.Tensor, context_length: int, n_ahead: int = 0) -> Windows:
         """
         The windows of K steps that end at the given steps, actions in the environment's range.
 
         :param ends: (B,) int64 positions among the buffer's own steps, episode after episode
         :param context_length: K
+        :param n_ahead: actions after the newest step that `actions` (B, K + n_ahead, A) holds too, an episode's last one again
+            and again where it ends
         """
-        last_rows, last_timesteps = self._locate(ends.to(self._stops.device))
+        last_rows, last_timesteps, n_left = self._locate(ends.to(self._stops.device))
         back = th.arange(1 - context_length, 1, device=last_rows.device)
         timesteps = last_timesteps.unsqueeze(1) + back  # (B, K), negative before the episode's start
         mask = timesteps >= 0
@@ -330,15 +339,20 @@ class TrajectoryBuffer:
             timesteps=timesteps.clamp_(min=0),
             mask=mask,
         )
+        if n_ahead:
+            ahead = th.arange(1, n_ahead + 1, device=last_rows.device)
+            rows_ahead = last_rows.unsqueeze(1) + th.minimum(ahead, n_left.unsqueeze(1))
+            actions_ahead = self.actions.index_select(0, rows_ahead.flatten()).view(len(ends), n_ahead, -1)
+            batch = batch._replace(actions=th.cat((batch.actions, actions_ahead), dim=1))
         if self.device.type == rows.device.type:
             return batch
         return Windows(*(tensor.pin_memory().to(self.device, non_blocking=True) for tensor in batch))
 
-    def _locate(self, positions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Rows in the flat tensors, and time steps, of positions among the buffer's own steps."""
+    def _locate(self, positions: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """Of positions among the buffer's own steps: rows in the flat tensors, time steps, and steps left in the episode."""
         episodes = th.searchsorted(self._stops, positions, right=True)
         timesteps = positions - self._firsts[episodes]
-        return self._starts[episodes] + timesteps, timesteps
+        return self._starts[episodes] + timesteps, timesteps, self._stops[episodes] - 1 - positions
 
 
 def _episode_row(trajectory: Trajectory, start: int, to_go: np.ndarray) -> tuple:

@@ -13,13 +13,13 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, PROBABILITY_BELOW_1, Choice, Rule, check_arguments
+from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, PROBABILITY_BELOW_1, Choice, Number, Rule, check_arguments
 from sb3_dtfm.heads import ActionHead
 from sb3_dtfm.networks.cpu import hand_out, take_up
 from sb3_dtfm.networks.trunk import SequenceTrunk
 from sb3_dtfm.policies.memory import RememberedContext
 from sb3_dtfm.policies.normalization import Normalization
-from sb3_dtfm.windows import Context, Windows, empty_context, push, restarts, unpack_observation, with_action
+from sb3_dtfm.windows import Context, Windows, empty_context, push, restarts, unpack_observation, with_plan
 
 # Rows of the table that deterministic acting takes its noise from.
 NOISE_ROWS = 1024
@@ -32,6 +32,7 @@ ACCEPTED: dict[str, Rule] = {
     "dropout": PROBABILITY_BELOW_1,
     "timestep_embedding": BOOLEAN,
     "tokens_per_step": Choice((1, 3)),
+    "chunk_size": COUNT,
     "weight_decay": NOT_NEGATIVE,
     "clip_return_to_go": BOOLEAN,
     "kv_cache": BOOLEAN,
@@ -70,6 +71,9 @@ class SequencePolicy(BasePolicy):
     :param timestep_embedding: tell the trunk the absolute time step, as Decision Transformer does
     :param tokens_per_step: 3, return-to-go, observation and action, as Decision Transformer does; or 1, the sum of a step's
         return-to-go, its observation and the action before it: a third of the products
+    :param chunk_size: H, actions that one hidden state leads to: the newest step's and the next ones (action chunking, Zhao
+        et al., 2023; Chi et al., 2023). 1 is Decision Transformer's
+    :param n_action_steps: how many of them are carried out before the policy looks again, half of them if not given
     :param weight_decay: AdamW's, on weight matrices only
     :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step. Asking for more than
         any episode reached, or falling behind, then stays an input like those the policy learned from
@@ -99,6 +103,8 @@ class SequencePolicy(BasePolicy):
         dropout: float = 0.1,
         timestep_embedding: bool = True,
         tokens_per_step: int = 3,
+        chunk_size: int = 1,
+        n_action_steps: int | None = None,
         weight_decay: float = 1e-3,
         clip_return_to_go: bool = False,
         ema: bool = False,
@@ -109,18 +115,23 @@ class SequencePolicy(BasePolicy):
         super().__init__(observation_space, action_space, normalize_images=False, optimizer_class=th.optim.AdamW)
         arguments = {name: value for name, value in locals().items() if name in _own_parameters()}
         arguments.update(check_arguments(arguments, ACCEPTED))
+        if n_action_steps is None:
+            arguments["n_action_steps"] = (arguments["chunk_size"] + 1) // 2
         self._check_names(head_options)
-        self._constructor_arguments = {**arguments, **self.head_class.options(), **head_options}
         self.context_length = context_length
         self.weight_decay = arguments["weight_decay"]
         self.kv_cache = arguments["kv_cache"]
+        self.chunk_size = arguments["chunk_size"]
+        arguments.update(check_arguments(arguments, self._acting_rules()))
+        self.n_action_steps = arguments["n_action_steps"]
+        self._constructor_arguments = {**arguments, **self.head_class.options(), **head_options}
         self.seed = seed
         self.observation_dim = int(observation_space["observation"].shape[0])  # type: ignore[index]
         self.action_dim = int(action_space.shape[0])
         self.normalization = Normalization(self.observation_dim, action_space, max_timestep, clip_return_to_go)
         sizes = (self.observation_dim, self.action_dim, max_timestep, embed_dim, n_layers, n_heads)
         trunk = SequenceTrunk(*sizes, dropout, timestep_embedding, tokens_per_step)
-        self.network = SequenceNetwork(trunk, self.head_class(embed_dim, self.action_dim, **head_options))
+        self.network = SequenceNetwork(trunk, self.head_class(embed_dim, self.chunk_size * self.action_dim, **head_options))
         self.ema_network = copy.deepcopy(self.network).requires_grad_(False) if ema else None
         self.optimizer = self._make_optimizer(lr_schedule(1.0))
         generator = th.Generator().manual_seed(0 if seed is None else seed)
@@ -194,7 +205,7 @@ class SequencePolicy(BasePolicy):
 
     def draw_noise(self, batch: Windows, generator: th.Generator) -> tuple[th.Tensor, ...]:
         """What the head's loss draws at random for a batch, see :meth:`ActionHead.draw_noise`."""
-        return self.network.head.draw_noise(batch.actions, generator)
+        return self.network.head.draw_noise(self._chunks(batch.actions), generator)
 
     def part_masks(self, mask: th.Tensor) -> dict[str, th.Tensor]:
         """See :meth:`ActionHead.part_masks`."""
@@ -202,12 +213,18 @@ class SequencePolicy(BasePolicy):
 
     def compute_loss(self, batch: Windows, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """
-        :param batch: windows of a buffer, actions in the environment's range
+        :param batch: windows of a buffer, actions in the environment's range, (B, K + H - 1, A) of them
         :param noise: what :meth:`draw_noise` gave for the batch
         :return: the loss to minimise, and its parts by their logged names
         """
         windows = self.scaled_windows(batch)
-        return self.network.head.loss(self.hidden_states(self.network, windows), windows.actions, windows.mask, *noise)
+        chunks = self._chunks(windows.actions)
+        windows = windows._replace(actions=windows.actions[:, : self.context_length])
+        return self.network.head.loss(self.hidden_states(self.network, windows), chunks, windows.mask, *noise)
+
+    def _chunks(self, actions: th.Tensor) -> th.Tensor:
+        """From actions (B, K + H - 1, A) to the H from each of K steps on, (B, K, H A), one after the other."""
+        return actions.unfold(1, self.chunk_size, 1).transpose(2, 3).flatten(2)
 
     def action_mse(self, batch: Windows, generator: th.Generator) -> th.Tensor:
         """
@@ -224,7 +241,7 @@ class SequencePolicy(BasePolicy):
             network = self.acting_network
             hidden = self.hidden_states(network, windows, last_only=True).squeeze(1)
             actions = network.head(hidden, standard_normal(len(hidden), network.head.noise_dim, generator)).clamp(-1.0, 1.0)
-            return (actions - windows.actions[:, -1]).square().mean()
+            return (actions[:, : self.action_dim] - windows.actions[:, -1]).square().mean()
 
     def update_ema(self, decay: float) -> None:
         """
@@ -265,7 +282,7 @@ class SequencePolicy(BasePolicy):
         if remembers:
             before = self._remembered.recall(arrays[0], timestep)
         if before is None:
-            before = empty_context(n_rows, self.context_length, self.observation_dim, self.action_dim)
+            before = self._empty_context(n_rows)
         if before.observations.shape != (expected := (n_rows, self.context_length, self.observation_dim)):
             raise ValueError(f"state holds observations of shape {before.observations.shape}; {expected} is expected.")
         lost = restarts(before, timestep) & (timestep > 0)
@@ -274,11 +291,10 @@ class SequencePolicy(BasePolicy):
         if lost.any():
             self._remembered.warn(f"Time step {timestep[lost][0]} follows none that is known: its past is missing.")
         context = push(before, *arrays, episode_start=episode_start)
-        scaled_action, keys_values = self._act(context, deterministic)
-        context = with_action(context, scaled_action)._replace(keys_values=keys_values)
+        context = self._act(context, deterministic)
         if remembers:
             self._remembered.remember(before, context)
-        action = self._to_environment(scaled_action)
+        action = self._to_environment(context.actions[:, -1])
         return action if vectorized else action.squeeze(axis=0), tuple(context)
 
     def reset(self) -> None:
@@ -290,21 +306,36 @@ class SequencePolicy(BasePolicy):
         action = self.unscale_action(scaled_action).astype(self.action_space.dtype)
         return np.clip(action, self.action_space.low, self.action_space.high)
 
-    def _act(self, context: Context, deterministic: bool) -> tuple[np.ndarray, np.ndarray]:
-        """The newest step's actions, (B, A) in [-1, 1], and the keys and values to keep."""
+    def _empty_context(self, n_rows: int) -> Context:
+        sizes = (self.context_length, self.observation_dim, self.action_dim)
+        return empty_context(n_rows, *sizes, plan_length=self.n_action_steps - 1)
+
+    def _act(self, context: Context, deterministic: bool) -> Context:
+        """Fill in the newest step's actions, in [-1, 1]: planned ones, and chosen ones where none are left."""
         if self.training:
             self.set_training_mode(False)  # goes through all modules
         device = self.device  # SB3 looks for it among the parameters each time
         network = self.acting_network
+        n_rows, plan_length = len(context.mask), self.n_action_steps - 1
+        if context.plan.shape[1] != plan_length:  # another n_action_steps by now
+            context = context._replace(n_planned=np.zeros(n_rows, np.int64), plan=self._empty_context(n_rows).plan)
+        due = context.n_planned == 0
+        if not self.kv_cache and not due.any():
+            return with_plan(context, due, np.zeros((0, plan_length + 1, self.action_dim), np.float32))
+        without_keys = context._replace(keys_values=np.zeros((n_rows, 0), np.float32))
+        asked = context if due.all() else Context(*(each[due] for each in without_keys))
         with th.inference_mode():
-            windows = Windows(*(th.from_numpy(array).to(device) for array in context.windows))
+            windows = Windows(*(th.from_numpy(array).to(device) for array in (context if self.kv_cache else asked).windows))
             if self.kv_cache and self.context_length > 1:
                 hidden, keys_values = self._extend(self.normalization(windows), context.keys_values)
+                hidden = hidden if due.all() else hidden[th.from_numpy(due).to(device)]
             else:
                 hidden = self.hidden_states(network, windows, last_only=True).squeeze(1)
-                keys_values = np.zeros((len(hidden), 0), np.float32)
-            noise = self._acting_noise(context, deterministic).to(device)
-            return network.head(hidden, noise).clamp(-1.0, 1.0).cpu().numpy(), keys_values
+                keys_values = np.zeros((n_rows, 0), np.float32)
+            noise = self._acting_noise(asked, deterministic).to(device)
+            chunk = network.head(hidden, noise).clamp(-1.0, 1.0).cpu().numpy()
+        chunk = chunk.reshape(-1, self.chunk_size, self.action_dim)[:, : self.n_action_steps]
+        return with_plan(context, due, chunk)._replace(keys_values=keys_values)
 
     def _extend(self, windows: Windows, kept: np.ndarray) -> tuple[th.Tensor, np.ndarray]:
         """
@@ -359,9 +390,8 @@ class SequencePolicy(BasePolicy):
         assert isinstance(observation, dict)
         numbers = {key: value.cpu().numpy() for key, value in observation.items()}
         arrays, _ = unpack_observation(numbers, self.observation_dim)
-        context = empty_context(len(arrays[0]), self.context_length, self.observation_dim, self.action_dim)
-        scaled_action, _ = self._act(push(context, *arrays), deterministic)
-        return th.as_tensor(self._to_environment(scaled_action), device=self.device)
+        context = self._act(push(self._empty_context(len(arrays[0])), *arrays), deterministic)
+        return th.as_tensor(self._to_environment(context.actions[:, -1]), device=self.device)
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(observation, deterministic)
@@ -369,7 +399,12 @@ class SequencePolicy(BasePolicy):
     def acting_settings(self) -> dict[str, Any]:
         """How to act: what may be changed after training, and is saved with the weights."""
         head = self.network.head
-        return {"kv_cache": self.kv_cache, **{name: getattr(head, name) for name in head.acting_choices}}
+        own = {name: getattr(self, name) for name in self._acting_rules()}
+        return {**own, **{name: getattr(head, name) for name in head.acting_choices}}
+
+    def _acting_rules(self) -> dict[str, Rule]:
+        """The policy's own ways of acting; the others are the head's."""
+        return {"kv_cache": BOOLEAN, "n_action_steps": Number(low=1, high=self.chunk_size, whole=True)}
 
     def set_acting(self, **settings: Any) -> None:
         """
@@ -382,9 +417,10 @@ class SequencePolicy(BasePolicy):
         if unknown:
             raise ValueError(f"{', '.join(unknown)}: no way of acting; accepted are {', '.join(self.acting_settings())}.")
         settings = {**self.acting_settings(), **settings}
-        own = check_arguments(settings, {"kv_cache": BOOLEAN})
+        own = check_arguments(settings, self._acting_rules())
         heads = self.network.head.check_acting(**{name: settings[name] for name in self.head_class.acting_choices})
-        self.kv_cache = own["kv_cache"]
+        for name, value in own.items():
+            setattr(self, name, value)
         for name, value in heads.items():
             setattr(self.network.head, name, value)
             setattr(self.acting_network.head, name, value)
