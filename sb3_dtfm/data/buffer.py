@@ -322,8 +322,8 @@ class TrajectoryBuffer:
 
         :param ends: (B,) int64 positions among the buffer's own steps, episode after episode
         :param context_length: K
-        :param n_ahead: actions after the newest step that `actions` (B, K + n_ahead, A) holds too, an episode's last one again
-            and again where it ends
+        :param n_ahead: actions after the newest step that `actions` (B, K + n_ahead, A) holds too; where the episode ends,
+            its last one again and again
         """
         last_rows, last_timesteps, n_left = self._locate(ends.to(self._stops.device))
         back = th.arange(1 - context_length, 1, device=last_rows.device)

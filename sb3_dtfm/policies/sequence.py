@@ -314,28 +314,34 @@ class SequencePolicy(BasePolicy):
         """Fill in the newest step's actions, in [-1, 1]: planned ones, and chosen ones where none are left."""
         if self.training:
             self.set_training_mode(False)  # goes through all modules
+        if context.plan.shape[1] != self.n_action_steps - 1:  # it was another number by then
+            nothing = self._empty_context(len(context.mask))
+            context = context._replace(plan=nothing.plan, n_planned=nothing.n_planned)
+        due = context.n_planned == 0
+        with th.inference_mode():
+            chunks, keys_values = self._choose(context, due, deterministic)
+        return with_plan(context, due, chunks[:, : self.n_action_steps])._replace(keys_values=keys_values)
+
+    def _choose(self, context: Context, due: np.ndarray, deterministic: bool) -> tuple[np.ndarray, np.ndarray]:
+        """
+        :param due: (B,) bool, rows that need new actions, b of them
+        :return: (b, H, A) in [-1, 1], and the keys and values to keep, which grow with each step, due or not
+        """
         device = self.device  # SB3 looks for it among the parameters each time
         network = self.acting_network
-        n_rows, plan_length = len(context.mask), self.n_action_steps - 1
-        if context.plan.shape[1] != plan_length:  # another n_action_steps by now
-            context = context._replace(n_planned=np.zeros(n_rows, np.int64), plan=self._empty_context(n_rows).plan)
-        due = context.n_planned == 0
-        if not self.kv_cache and not due.any():
-            return with_plan(context, due, np.zeros((0, plan_length + 1, self.action_dim), np.float32))
-        without_keys = context._replace(keys_values=np.zeros((n_rows, 0), np.float32))
-        asked = context if due.all() else Context(*(each[due] for each in without_keys))
-        with th.inference_mode():
-            windows = Windows(*(th.from_numpy(array).to(device) for array in (context if self.kv_cache else asked).windows))
-            if self.kv_cache and self.context_length > 1:
-                hidden, keys_values = self._extend(self.normalization(windows), context.keys_values)
-                hidden = hidden if due.all() else hidden[th.from_numpy(due).to(device)]
-            else:
-                hidden = self.hidden_states(network, windows, last_only=True).squeeze(1)
-                keys_values = np.zeros((n_rows, 0), np.float32)
-            noise = self._acting_noise(asked, deterministic).to(device)
-            chunk = network.head(hidden, noise).clamp(-1.0, 1.0).cpu().numpy()
-        chunk = chunk.reshape(-1, self.chunk_size, self.action_dim)[:, : self.n_action_steps]
-        return with_plan(context, due, chunk)._replace(keys_values=keys_values)
+        caches = self.kv_cache and self.context_length > 1
+        windows = Windows(*(th.from_numpy(each if caches else each[due]).to(device) for each in context.windows))
+        keys_values = np.zeros((len(due), 0), np.float32)
+        if caches:
+            hidden, keys_values = self._extend(self.normalization(windows), context.keys_values)
+            hidden = hidden[th.from_numpy(due).to(device)]
+        if not due.any():
+            return np.zeros((0, self.chunk_size, self.action_dim), np.float32), keys_values
+        if not caches:
+            hidden = self.hidden_states(network, windows, last_only=True).squeeze(1)
+        noise = self._acting_noise(context.timesteps[due, -1] + context.episode_keys[due], deterministic).to(device)
+        actions = network.head(hidden, noise).clamp(-1.0, 1.0)
+        return actions.cpu().numpy().reshape(-1, self.chunk_size, self.action_dim), keys_values
 
     def _extend(self, windows: Windows, kept: np.ndarray) -> tuple[th.Tensor, np.ndarray]:
         """
@@ -363,15 +369,14 @@ class SequencePolicy(BasePolicy):
             kept = hand_out(memory, start + n_new, end)
         return hidden, kept
 
-    def _acting_noise(self, context: Context, deterministic: bool) -> th.Tensor:
-        """What the newest step's actions start from, (B, noise_dim)."""
+    def _acting_noise(self, rows: np.ndarray, deterministic: bool) -> th.Tensor:
+        """What the newest step's actions start from, (B, noise_dim): of these rows of the table, (B,), or fresh."""
         if deterministic or self.network.head.noise_dim == 0:
-            rows = (context.timesteps[:, -1] + context.episode_keys) % NOISE_ROWS
-            return self.noise_table[th.from_numpy(rows).to(self.noise_table.device)]
+            return self.noise_table[th.from_numpy(rows % NOISE_ROWS).to(self.noise_table.device)]
         if self._acting_generator is None:
             self.seed_noise(self.seed)
         assert self._acting_generator is not None
-        return standard_normal(len(context.mask), self.network.head.noise_dim, self._acting_generator)
+        return standard_normal(len(rows), self.network.head.noise_dim, self._acting_generator)
 
     def seed_noise(self, seed: int | None) -> None:
         """

@@ -56,6 +56,23 @@ def test_windows_equal_a_naive_reference_with_padding_at_the_start(context_lengt
             row += 1
 
 
+@pytest.mark.parametrize("n_ahead", [1, 4])
+def test_actions_ahead_are_the_next_ones_and_an_episodes_last_goes_on(n_ahead: int):
+    lengths = [5, 1, 12, 2]
+    buffer = make_buffer(lengths)
+    plain = buffer.windows(th.arange(len(buffer)), 3)
+    batch = buffer.windows(th.arange(len(buffer)), 3, n_ahead)
+    assert batch.actions.shape == (sum(lengths), 3 + n_ahead, 2)
+    assert all(each.equal(other) for each, other in zip(batch._replace(actions=batch.actions[:, :3]), plain, strict=True))
+    row = 0
+    for episode, length in enumerate(lengths):
+        actions = make_trajectory(length, episode).actions.astype(np.float32)
+        for end in range(length):
+            expected = actions[np.minimum(end + 1 + np.arange(n_ahead), length - 1)]
+            np.testing.assert_array_equal(batch.actions[row, 3:].numpy(), expected)
+            row += 1
+
+
 def test_windows_end_at_every_step_with_equal_probability():
     buffer = make_buffer([1, 3, 30, 66])
     buffer.observations[:, 0] = th.arange(len(buffer))

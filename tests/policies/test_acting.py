@@ -10,14 +10,15 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.heads import FlowHead
 from sb3_dtfm.policies import DTFMPolicy
-from sb3_dtfm.windows import empty_context
 from tests.conftest import TINY_FLOW_POLICY, TINY_POLICY, make_env
 
 ALGORITHMS = [(DT, TINY_POLICY), (DTFM, TINY_FLOW_POLICY)]
 ONE_TOKEN = [(algorithm, {**policy_kwargs, "tokens_per_step": 1}) for algorithm, policy_kwargs in ALGORITHMS]
+CHUNKS = [(algorithm, {**policy_kwargs, "chunk_size": 4, "n_action_steps": 3}) for algorithm, policy_kwargs in ONE_TOKEN]
+IDS = [f"{algorithm}{variant}" for variant in ("", ", one token", ", chunks") for algorithm in ("dt", "dtfm")]
 
 
-@pytest.fixture(params=ALGORITHMS + ONE_TOKEN, ids=["dt", "dtfm", "dt, one token", "dtfm, one token"])
+@pytest.fixture(params=ALGORITHMS + ONE_TOKEN + CHUNKS, ids=IDS)
 def model(request, cheetah_buffer):
     algorithm, policy_kwargs = request.param
     return algorithm(
@@ -125,12 +126,11 @@ def test_fresh_noise_differs_and_deterministic_noise_is_not_zero(cheetah_buffer)
     observation, _ = make_env().reset(seed=0)
     drawn = [model.predict(observation, deterministic=False)[0] for _ in range(2)]
     assert not np.allclose(*drawn)
-    context = empty_context(3, 20, 17, 6)._replace(episode_keys=np.array([5, 5, 5]))
-    context.timesteps[:, -1] = [0, 1, 7]
-    noise = model.policy._acting_noise(context, deterministic=True)
+    rows = np.array([5, 6, 12])
+    noise = model.policy._acting_noise(rows, deterministic=True)
     assert noise.abs().min() > 0
     assert len(noise.unique(dim=0)) == 3
-    assert th.equal(noise, model.policy._acting_noise(context, deterministic=True))
+    assert th.equal(noise, model.policy._acting_noise(rows, deterministic=True))
 
 
 def test_episodes_that_start_elsewhere_have_another_deterministic_noise(cheetah_buffer, monkeypatch):
@@ -307,7 +307,8 @@ def test_one_step_acting_is_one_evaluation_saved_with_the_model(cheetah_buffer, 
     model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=policy_kwargs, batch_size=16, seed=0).learn(5)
     model.save(tmp_path / "model.zip")
     loaded = DTFM.load(tmp_path / "model.zip")
-    assert loaded.policy.acting_settings() == {"solver": "one_step", "n_solver_steps": 4, "kv_cache": True}
+    settings = {"solver": "one_step", "n_solver_steps": 4, "kv_cache": True, "n_action_steps": 1}
+    assert loaded.policy.acting_settings() == settings
     assert np.array_equal(roll_plain(model, 8), roll_plain(loaded, 8))
     model.policy.set_solver("euler", 10)
     assert not np.allclose(roll_plain(model, 8), roll_plain(loaded, 8))
@@ -319,7 +320,8 @@ def test_a_way_of_acting_that_was_chosen_after_training_is_saved(cheetah_buffer,
     model.policy.set_acting(kv_cache=True)
     model.save(tmp_path / "model.zip")
     loaded = DTFM.load(tmp_path / "model.zip")
-    assert loaded.policy.acting_settings() == {"solver": "heun", "n_solver_steps": 3, "kv_cache": True}
+    settings = {"solver": "heun", "n_solver_steps": 3, "kv_cache": True, "n_action_steps": 1}
+    assert loaded.policy.acting_settings() == settings
     assert np.array_equal(roll_plain(model, 8), roll_plain(loaded, 8))
 
 
