@@ -17,6 +17,7 @@ import torch as th
 
 import sb3_dtfm
 from sb3_dtfm.data import load_dataset
+from sb3_dtfm.data.npz import is_npz
 
 PACKAGES = ("sb3-dtfm", "torch", "stable-baselines3", "rl_zoo3", "gymnasium", "mujoco", "robosuite", "numpy")
 GIT_TIMEOUT = 20  # seconds
@@ -87,13 +88,18 @@ def describe_data(
     buffer = load_dataset(dataset, **dataset_kwargs)
     buffer.check_task(env_id)
     in_file = Path(dataset).expanduser().is_file()
+    source_of = _not_named if is_npz(dataset) else _robomimic_source if in_file else _minari_source
     return {
         "dataset": Path(dataset).name if in_file else dataset,
-        "recorded_from": recorded_from or (_robomimic_source(dataset) if in_file else _minari_source(dataset)),
+        "recorded_from": recorded_from or source_of(dataset),
         "n_episodes": buffer.n_episodes,
         "n_steps": len(buffer),
         "mean_return": round(float(np.mean(buffer.episode_returns)), 4),
     }
+
+
+def _not_named(dataset: str) -> str:
+    return "not named"
 
 
 def _minari_source(dataset_id: str) -> str:

@@ -18,6 +18,7 @@ COMMANDS = {
     "record": "Make a dataset from a trained agent or a scripted demonstrator.",
     "demo": "Record, train and evaluate on robosuite's Lift, start to end.",
     "plot": "Draw the learning curve of a run of `train`.",
+    "sweep": "Ask trained models for one return after the other, and see what they reach.",
     "benchmark": "Compare DT and DTFM on a grid of tasks, shares of the data and seeds.",
     "report": "Make tables and figures from the results of `benchmark`.",
 }

@@ -1,0 +1,62 @@
+"""Return asked for against return reached: real models, real episodes."""
+
+import re
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from sb3_dtfm.cli.main import main
+from sb3_dtfm.cli.sweep import Asked, draw, table
+from tests.recorded import DATASET_ID, tiny_training
+
+SWEEP = ["--env", "HalfCheetah-v5", "--dataset", DATASET_ID, "--episodes", "2", "--env-kwargs", "max_episode_steps:20"]
+
+
+def test_two_models_are_asked_for_the_range_of_their_data(workplace, capsys):
+    for algo in ("dt", "dtfm"):
+        assert main([*tiny_training(algo), "--dataset", DATASET_ID, "--eval-freq", "-1", "--target-return", "5"]) == 0
+    capsys.readouterr()
+    runs = ["logs/dt/HalfCheetah-v5_1", "logs/dtfm/HalfCheetah-v5_1/HalfCheetah-v5.zip"]
+    assert main(["sweep", *runs, *SWEEP, "--points", "3", "-o", "figures/sweep.png"]) == 0
+    text = capsys.readouterr().out
+    header, _, *rows = [line for line in text.splitlines() if line.startswith("|")]
+    assert header == "| asked | DT, HalfCheetah-v5_1 | DTFM, HalfCheetah-v5 |"
+    assert len(rows) == 3
+    assert all(re.fullmatch(r"\| -?[\d.]+ \|( -?[\d.]+ \[-?[\d.]+, -?[\d.]+\] \|){2}", row) for row in rows)
+    assert (workplace / "figures" / "sweep.png").stat().st_size > 10_000
+    assert main(["sweep", runs[1], *SWEEP, "--returns", "1", "2", "-o", "figures/again.png"]) == 0
+    again = [line for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+    assert [line.split("|")[1].strip() for line in again[2:]] == ["1", "2"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere.zip", "--algo", "dt", *SWEEP], "nowhere.zip does not exist; expected a model of dt or dtfm"),
+        (["model.zip", *SWEEP], "model.zip: of which algorithm? Expected a folder dt or dtfm in its path, or --algo."),
+        (["dt/model.zip", *SWEEP, "--dataset", "none.npz"], "none.npz does not exist"),
+    ],
+)
+def test_what_is_not_there_is_named(arguments, message, workplace, capsys):
+    (workplace / "model.zip").touch()
+    assert main(["sweep", *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_the_table_and_the_picture_say_what_was_reached(tmp_path, monkeypatch):
+    drawn = []
+    save = Figure.savefig
+    monkeypatch.setattr(
+        Figure, "savefig", lambda figure, *args, **kwargs: drawn.append(figure) or save(figure, *args, **kwargs)
+    )
+    curves = {
+        "DT": [Asked(1.0, [1.0, 3.0]), Asked(5.0, [4.0, 4.0])],
+        "DTFM": [Asked(1.0, [1.0, 1.0]), Asked(5.0, [5.0, 5.0])],
+    }
+    assert table(curves)[2:] == ["| 1 | 2 [-10.7062, 14.7062] | 1 |", "| 5 | 4 | 5 |"]
+    draw(curves, np.array([0.0, 1.0, 5.0]), tmp_path / "sweep.png", "HalfCheetah-v5")
+    asked, *models = drawn[0].axes[0].lines
+    assert asked.get_ydata().tolist() == [1, 5]
+    assert [line.get_ydata().tolist() for line in models] == [[2, 4], [1, 5]]
+    assert [text.get_text() for text in drawn[0].axes[0].get_legend().get_texts()] == ["what was asked for", "DT", "DTFM"]
