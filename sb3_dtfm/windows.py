@@ -20,7 +20,8 @@ class Windows(NamedTuple):
 
     Tensors on their way through a network, arrays in a :class:`Context`. Shapes: observations (B, K, O), actions (B, K, A),
     returns_to_go (B, K) in environment reward units, timesteps (B, K) int64 counted from the episode's start, mask (B, K)
-    bool. Whoever hands windows on says in which units observations and actions are.
+    bool. Whoever hands windows on says in which units observations and actions are. A batch to learn chunks from has more
+    actions, (B, K + H - 1, A): those after the newest step.
     """
 
     observations: Any

@@ -1,5 +1,5 @@
 """
-DTFM beside its peer d3rlpy, in turn on one machine: `make bench`.
+DT and DTFM beside their peer d3rlpy, in turn on one machine: `make bench`.
 
 Prints docs/performance.md's tables of training and acting: medians over repeats, each in a process of its own, and ratios
 of the medians. Peers come from PyPI in an environment of their own.
@@ -20,7 +20,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from worker import BATCH_SIZE, CONTEXT_LENGTH, make_model
 
 HERE = Path(__file__).parent
-# Name: width, layers, width of the flow head (512 by default, 256 in the small profile), gradient steps to measure.
+# Name: width, layers, width of the flow head (512 by default), gradient steps to measure.
 SIZES = {
     "width 128, 3 layers, head 256": (128, 3, 256, 15),
     "width 128, 3 layers, head 512": (128, 3, 512, 15),

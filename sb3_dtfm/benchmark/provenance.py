@@ -17,7 +17,7 @@ import torch as th
 
 import sb3_dtfm
 from sb3_dtfm.data import load_dataset
-from sb3_dtfm.data.npz import is_npz
+from sb3_dtfm.data.minari import is_minari
 
 PACKAGES = ("sb3-dtfm", "torch", "stable-baselines3", "rl_zoo3", "gymnasium", "mujoco", "robosuite", "numpy")
 GIT_TIMEOUT = 20  # seconds
@@ -79,7 +79,7 @@ def describe_data(
     What a dataset was recorded from, and how good that was: the scale of normalised scores.
 
     :param env_id: of the task
-    :param dataset: Minari id or robomimic file
+    :param dataset: Minari id, robomimic or .npz file
     :param dataset_kwargs: of :func:`~sb3_dtfm.data.load_dataset`
     :param recorded_from: the agent or demonstrator, read from the dataset's metadata if not given
     :return: dataset (a file without its folder), recorded_from, n_episodes, n_steps, and mean_return of the episodes
@@ -88,7 +88,8 @@ def describe_data(
     buffer = load_dataset(dataset, **dataset_kwargs)
     buffer.check_task(env_id)
     in_file = Path(dataset).expanduser().is_file()
-    source_of = _not_named if is_npz(dataset) else _robomimic_source if in_file else _minari_source
+    in_hdf5 = h5py.is_hdf5(Path(dataset).expanduser())
+    source_of = _robomimic_source if in_hdf5 else _minari_source if is_minari(dataset) else _not_named
     return {
         "dataset": Path(dataset).name if in_file else dataset,
         "recorded_from": recorded_from or source_of(dataset),

@@ -1,25 +1,29 @@
 """`sb3-dtfm sweep`: the return that models reach against the return that they are asked for."""
 
 import argparse
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from rl_zoo3.utils import get_saved_hyperparams
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.env_util import make_vec_env
 from tqdm import tqdm
 
 from sb3_dtfm.algorithms import ALGORITHMS
-from sb3_dtfm.benchmark.evaluation import evaluate, make_seeded_envs
+from sb3_dtfm.benchmark.evaluation import SeededEpisodes, evaluate
 from sb3_dtfm.benchmark.report.statistics import Interval, student_t
-from sb3_dtfm.benchmark.settings import WRAPPER
 from sb3_dtfm.data import load_dataset
+from sb3_dtfm.envs import ReturnToGoWrapper
+from sb3_dtfm.recording.loading import AgentFiles, find_agent, load_agent
 from sb3_dtfm.zoo.arguments import UsageError, key_values
 
 COLORS = ("#1b6ca8", "#c0562b", "#3f8f5f", "#7b5ea7")
 # First seed of the initial states: apart from those of recordings and benchmarks.
 FIRST_STATE = 4_000_000
+# Between the initial states of two seeds.
+SEED_STRIDE = 10_000
 
 
 class Asked(NamedTuple):
@@ -46,15 +50,19 @@ def main(argv: Sequence[str]) -> None:
     :param argv: its arguments
     """
     options = _parser().parse_args(argv)
-    models = [Path(model) for model in options.models]
+    algorithms = [options.algo or _algorithm_of(model) for model in options.models]
     returns = load_dataset(options.dataset, **key_values("--dataset-kwargs", options.dataset_kwargs)).episode_returns
-    targets = options.returns or np.linspace(returns.min(), returns.max(), options.points).round(2).tolist()
-    swept = {}
+    agents = [find_agent(model, options.env) for model in options.models]
+    models = [load_agent(algo, agent.model, "cpu") for algo, agent in zip(algorithms, agents, strict=True)]
+    targets = options.returns or evenly(returns, options.points)
+    reached = []
     with tqdm(total=len(models) * len(targets) * options.episodes, unit="episode", disable=None) as progress:
-        for path in models:
-            swept[str(path)] = sweep(path, options, targets, progress)
-    names = [f"{_algorithm_of(path).upper()}, {path.stem if path.is_file() else path.name}" for path in models]
-    curves = dict(zip(names if len(set(names)) == len(names) else map(str, models), swept.values(), strict=True))
+        for model, agent in zip(models, agents, strict=True):
+            reached.append(sweep(model, agent, options, targets, progress))
+    names = [f"{algo.upper()}, {Path(model).stem}" for algo, model in zip(algorithms, options.models, strict=True)]
+    if len(set(names)) < len(names):
+        names = [f"{i}: {model}" for i, model in enumerate(options.models, 1)]
+    curves = dict(zip(names, reached, strict=True))
     print("\n".join(table(curves)))
     print(f"\nPicture: {draw(curves, returns, Path(options.output), options.env)}")
 
@@ -89,46 +97,52 @@ def _at_least(low: int) -> Any:
     return number
 
 
-def sweep(path: Path, options: argparse.Namespace, targets: Sequence[float], progress: tqdm) -> list[Asked]:
+def evenly(returns: np.ndarray, n: int) -> list[float]:
+    """
+    :param returns: (E,) of the recorded episodes
+    :param n: how many numbers
+    :return: from the smallest to the largest, four digits each; fewer where they do not differ by as much
+    """
+    return np.unique([float(f"{each:.4g}") for each in np.linspace(returns.min(), returns.max(), n)]).tolist()
+
+
+def sweep(
+    model: BaseAlgorithm, agent: AgentFiles, options: argparse.Namespace, targets: Sequence[float], progress: tqdm
+) -> list[Asked]:
     """
     Play episodes from the same initial states for each return.
 
-    :param path: zip file or run folder
+    :param model: acts
+    :param agent: says what its environment was in training
     :param options: of the command
     :param targets: returns to ask for, environment reward units
     :param progress: counts episodes
     """
-    file = path / f"{options.env.replace('/', '-')}.zip" if path.is_dir() else path
-    if not file.is_file():
-        raise FileNotFoundError(f"{file} does not exist; expected a model of dt or dtfm, or the folder of a run of `train`.")
-    model: BaseAlgorithm = ALGORITHMS[options.algo or _algorithm_of(path)].load(file, device="cpu")
-    settings = _settings(file, targets[0])
-    if options.env_kwargs:
-        settings["env_kwargs"] = key_values("--env-kwargs", options.env_kwargs)
-    vec_env = make_seeded_envs(options.env, settings, min(options.n_envs, options.episodes))
-    seeds = range(FIRST_STATE + options.seed, FIRST_STATE + options.seed + options.episodes)
+    wrap = agent.wrapper or functools.partial(ReturnToGoWrapper, target_return=targets[0])
+    vec_env = make_vec_env(
+        options.env,
+        min(options.n_envs, options.episodes),
+        wrapper_class=lambda env: SeededEpisodes(wrap(env)),
+        env_kwargs={**agent.env_kwargs, **key_values("--env-kwargs", options.env_kwargs)},
+    )
+    first = FIRST_STATE + SEED_STRIDE * options.seed
     reached = []
     for target in targets:
         vec_env.env_method("set_target_return", target)
         before = progress.n
         episodes = evaluate(
-            model, vec_env, seeds, lambda n_done, before=before: progress.update(before + n_done - progress.n)
+            model,
+            vec_env,
+            range(first, first + options.episodes),
+            lambda n_done, before=before: progress.update(before + n_done - progress.n),
         )
         reached.append(Asked(target, episodes.returns))
     vec_env.close()
     return reached
 
 
-def _settings(file: Path, target: float) -> dict[str, Any]:
-    """Of the run that a model lies in, or the return-to-go wrapper alone."""
-    run = file.parent / file.stem
-    if (run / "config.yml").is_file():
-        return dict(get_saved_hyperparams(str(run))[0])
-    return {"env_wrapper": [{WRAPPER: {"target_return": target}}]}
-
-
-def _algorithm_of(path: Path) -> str:
-    for part in path.parts:
+def _algorithm_of(path: str) -> str:
+    for part in Path(path).parts:
         if part in ALGORITHMS:
             return part
     raise UsageError(f"{path}: of which algorithm? Expected a folder {' or '.join(ALGORITHMS)} in its path, or --algo.")

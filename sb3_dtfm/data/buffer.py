@@ -29,8 +29,9 @@ class TrajectoryBuffer:
     """
     Steps of episodes in flat float32 tensors, sampled as windows that may end at any step.
 
-    Build it with :meth:`from_trajectories` or a reader (`load_minari`, `load_robomimic`). A buffer of some of the episodes
-    (:meth:`select`, :meth:`random_fraction`) shares the flat tensors with the one it comes from: `rows` are its own steps.
+    Build it with :meth:`from_trajectories`, or let :func:`~sb3_dtfm.data.load_dataset` read it. A buffer of some of the
+    episodes (:meth:`select`, :meth:`random_fraction`) shares the flat tensors with the one it comes from: `rows` are its own
+    steps.
 
     :ivar observations: (N, O) float32
     :ivar actions: (N, A) float32, in the environment's range
@@ -312,9 +313,9 @@ class TrajectoryBuffer:
         """Start to read windows from disk, if that is where they are, so that :meth:`windows` need not wait for them."""
         if self.memory_mapped:
             rows, _, n_left = self._locate(ends)
-            stops = (rows + n_left.clamp(max=n_ahead) + 1).tolist()
             for steps in self._maps:
-                steps.will_need(stops, context_length + n_ahead)
+                ahead = n_ahead if steps.name == "actions" else 0
+                steps.will_need((rows + n_left.clamp(max=ahead) + 1).tolist(), context_length + ahead)
 
     def windows(self, ends: th.Tensor, context_length: int, n_ahead: int = 0) -> Windows:
         """

@@ -3,6 +3,7 @@
 import contextlib
 import hashlib
 import json
+import os
 import re
 import shutil
 import zipfile
@@ -27,6 +28,21 @@ EPISODES = "episodes.npz"
 BOXES = ("observation_space", "action_space")
 # What numpy raises for a file that is missing, empty, cut off, or of another kind.
 READ_ERRORS = (OSError, EOFError, LookupError, TypeError, ValueError, zipfile.BadZipFile)
+
+
+def existing_file(path: str | os.PathLike[str], expected: str) -> Path:
+    """
+    The path of a dataset's file.
+
+    :param path: `~` is the home folder
+    :param expected: what it should be, for the message
+    :raises DatasetError: no such file
+    """
+    path = Path(path).expanduser()
+    if not path.is_file():
+        problem = "is a folder" if path.is_dir() else "does not exist"
+        raise DatasetError(f"{path.absolute()} {problem}; {expected} is expected.")
+    return path
 
 
 class Fingerprint(NamedTuple):

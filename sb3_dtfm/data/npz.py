@@ -2,6 +2,7 @@
 
 import os
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -9,9 +10,9 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_dtfm.data.buffer import TrajectoryBuffer
-from sb3_dtfm.data.cache import Fingerprint
+from sb3_dtfm.data.cache import Fingerprint, existing_file
 from sb3_dtfm.data.storage import FileStorage
-from sb3_dtfm.data.trajectories import DatasetError, Trajectory, existing_file
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory
 
 SUFFIX = ".npz"
 EXPECTED = "the path of a file of flat arrays (.npz)"
@@ -38,6 +39,8 @@ def fingerprint_npz(path: str | os.PathLike[str], options: dict[str, Any]) -> Fi
     :raises DatasetError: no such file
     """
     path = existing_file(path, EXPECTED)
+    if "action_bounds" in options:  # arrays become lists, as JSON can hold them
+        options = {**options, "action_bounds": [np.asarray(bound).tolist() for bound in options["action_bounds"]]}
     return Fingerprint.of(path.name, path, options)
 
 
@@ -54,12 +57,13 @@ def load_npz(
     Read are `observations` (N, O), `actions` (N, A) and `rewards` (N,), or what others call them (`obs`, `state`, `action`,
     `reward`). Episodes end where `episode_ends` says (E,), counting steps from the start of the file, or after
     `episode_lengths` (E,) each, or at the steps of `terminals` or `timeouts` (N,). Without rewards every episode counts as a
-    success: a reward of 1 at its last step. Nothing in the file is ever executed: arrays of Python objects are refused.
+    success: a reward of 1 at its last step. Nothing in the file is ever executed: arrays of Python objects are refused. The
+    file is read into memory, also to write a cache of it.
 
     :param path: the file
     :param observation_keys: which arrays make up the observation, in this order, each (N, ...)
     :param action_bounds: smallest and largest action that the environment accepts, numbers or (A,) each
-    :param clip_actions: bring actions outside of them to the nearest bound instead of refusing them
+    :param clip_actions: bring actions outside of them to the nearest bound, however far, instead of refusing them
     :param storage: where the steps go, memory if not given
     :raises DatasetError: no such file, damaged, arrays missing or of lengths that do not fit together, NaN or infinity, or
         actions out of bounds; names the file, the array, the episode and the step
@@ -67,11 +71,14 @@ def load_npz(
     path = existing_file(path, EXPECTED)
     source = str(path)
     try:
-        with np.load(path, allow_pickle=False) as file:
+        file = np.load(path, allow_pickle=False)
+        if not isinstance(file, np.lib.npyio.NpzFile):
+            raise DatasetError(f"{source}: holds a single array; {EXPECTED} is expected.")
+        with file:
             return _read(file, source, observation_keys, action_bounds, clip_actions, storage)
     except DatasetError:
         raise
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
         raise DatasetError(f"{source}: cannot be read ({error}); {EXPECTED} is expected.") from error
 
 
@@ -101,7 +108,7 @@ def _read(
         terminated[stops - 1] = True
     action_space = _action_space(action_bounds, actions.shape[1], source)
     if clip_actions:
-        actions = np.clip(actions, action_space.low, action_space.high)
+        actions = np.where(np.isfinite(actions), np.clip(actions, action_space.low, action_space.high), actions)
 
     def trajectories() -> Iterator[Trajectory]:
         for episode, (start, stop) in enumerate(zip((0, *stops[:-1]), stops, strict=True)):

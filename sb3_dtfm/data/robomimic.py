@@ -11,9 +11,9 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_dtfm.data.buffer import TrajectoryBuffer
-from sb3_dtfm.data.cache import Fingerprint
+from sb3_dtfm.data.cache import Fingerprint, existing_file
 from sb3_dtfm.data.storage import FileStorage
-from sb3_dtfm.data.trajectories import DatasetError, Trajectory, existing_file
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory
 from sb3_dtfm.envs.robosuite import env_id_from_robomimic
 
 DEFAULT_OBSERVATION_KEYS = ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos", "object")

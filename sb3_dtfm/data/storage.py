@@ -140,6 +140,7 @@ class MappedSteps:
     def __init__(self, folder: Path, name: str) -> None:
         # Copy on write: torch has no read-only tensors, and nothing that is written to one may reach the file.
         array = np.load(step_file(folder, name), mmap_mode="c")
+        self.name = name
         self.tensor = th.from_numpy(array)
         self._map: mmap.mmap = array.base
         if CAN_ADVISE:

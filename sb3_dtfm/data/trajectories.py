@@ -1,8 +1,6 @@
 """One recorded episode: what it holds, what makes it unfit for learning, and the return-to-go of its steps."""
 
-import os
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -40,21 +38,6 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.actions)
-
-
-def existing_file(path: str | os.PathLike[str], expected: str) -> Path:
-    """
-    The path of a dataset's file.
-
-    :param path: `~` is the home folder
-    :param expected: what it should be, for the message
-    :raises DatasetError: no such file
-    """
-    path = Path(path).expanduser()
-    if not path.is_file():
-        problem = "is a folder" if path.is_dir() else "does not exist"
-        raise DatasetError(f"{path.absolute()} {problem}; {expected} is expected.")
-    return path
 
 
 class ScoreReference(NamedTuple):

@@ -219,7 +219,7 @@ class SequencePolicy(BasePolicy):
         """
         windows = self.scaled_windows(batch)
         chunks = self._chunks(windows.actions)
-        windows = windows._replace(actions=windows.actions[:, : self.context_length])
+        windows = windows._replace(actions=windows.actions[:, : windows.mask.shape[1]])
         return self.network.head.loss(self.hidden_states(self.network, windows), chunks, windows.mask, *noise)
 
     def _chunks(self, actions: th.Tensor) -> th.Tensor:
@@ -285,6 +285,9 @@ class SequencePolicy(BasePolicy):
             before = self._empty_context(n_rows)
         if before.observations.shape != (expected := (n_rows, self.context_length, self.observation_dim)):
             raise ValueError(f"state holds observations of shape {before.observations.shape}; {expected} is expected.")
+        if before.plan.shape[1] != self.n_action_steps - 1:  # it was another number then
+            nothing = self._empty_context(n_rows)
+            before = before._replace(plan=nothing.plan, n_planned=nothing.n_planned)
         lost = restarts(before, timestep) & (timestep > 0)
         if episode_start is not None:
             lost &= ~np.asarray(episode_start, dtype=bool)
@@ -314,9 +317,6 @@ class SequencePolicy(BasePolicy):
         """Fill in the newest step's actions, in [-1, 1]: planned ones, and chosen ones where none are left."""
         if self.training:
             self.set_training_mode(False)  # goes through all modules
-        if context.plan.shape[1] != self.n_action_steps - 1:  # it was another number by then
-            nothing = self._empty_context(len(context.mask))
-            context = context._replace(plan=nothing.plan, n_planned=nothing.n_planned)
         due = context.n_planned == 0
         with th.inference_mode():
             chunks, keys_values = self._choose(context, due, deterministic)
@@ -327,17 +327,22 @@ class SequencePolicy(BasePolicy):
         :param due: (B,) bool, rows that need new actions, b of them
         :return: (b, H, A) in [-1, 1], and the keys and values to keep, which grow with each step, due or not
         """
+        caches, nothing = (
+            self.kv_cache and self.context_length > 1,
+            np.zeros((0, self.chunk_size, self.action_dim), np.float32),
+        )
+        keys_values = np.zeros((len(due), 0), np.float32)
+        if not caches and not due.any():
+            return nothing, keys_values
         device = self.device  # SB3 looks for it among the parameters each time
         network = self.acting_network
-        caches = self.kv_cache and self.context_length > 1
         windows = Windows(*(th.from_numpy(each if caches else each[due]).to(device) for each in context.windows))
-        keys_values = np.zeros((len(due), 0), np.float32)
         if caches:
             hidden, keys_values = self._extend(self.normalization(windows), context.keys_values)
+            if not due.any():
+                return nothing, keys_values
             hidden = hidden[th.from_numpy(due).to(device)]
-        if not due.any():
-            return np.zeros((0, self.chunk_size, self.action_dim), np.float32), keys_values
-        if not caches:
+        else:
             hidden = self.hidden_states(network, windows, last_only=True).squeeze(1)
         noise = self._acting_noise(context.timesteps[due, -1] + context.episode_keys[due], deterministic).to(device)
         actions = network.head(hidden, noise).clamp(-1.0, 1.0)

@@ -35,6 +35,8 @@ REFUSED_OF_THE_POLICY = {
     "dropout": (1.0, -0.1, NAN),
     "timestep_embedding": ("no", 0),
     "tokens_per_step": (0, 2, 1.0, True),
+    "chunk_size": (0, 2.5),
+    "n_action_steps": (0, 2, 1.5),
     "clip_return_to_go": ("no", None),
     "kv_cache": ("no", 1),
 }
@@ -130,7 +132,16 @@ def test_an_unknown_argument_of_the_policy_is_refused_with_those_accepted(algori
     """What only DTFM knows is unknown to DT."""
     with pytest.raises(ValueError, match=rf"policy_kwargs.*\b{name}\b") as refusal:
         make_model(algorithm, cheetah_buffer, policy_kwargs={name: 64})
-    own = {"embed_dim", "n_layers", "n_heads", "dropout", "timestep_embedding", "tokens_per_step", "clip_return_to_go"}
+    own = {
+        "embed_dim",
+        "n_layers",
+        "n_heads",
+        "dropout",
+        "timestep_embedding",
+        "tokens_per_step",
+        "chunk_size",
+        "n_action_steps",
+    }
     flow = {"flow_hidden_dim", "flow_n_layers", "flow_prediction", "solver", "n_solver_steps", "regression_coef"}
     words = re.findall(r"\w+", str(refusal.value).partition("accepted")[2])
     assert own <= set(words)
@@ -145,6 +156,7 @@ NUMPY = dict(
 NUMPY_POLICY = dict(
     embed_dim=np.int64(16), n_layers=np.int64(1), n_heads=np.int32(2), dropout=np.float32(0.1),
     timestep_embedding=np.False_, tokens_per_step=np.int64(1), kv_cache=np.True_,
+    chunk_size=np.int64(3), n_action_steps=np.int64(2),
 )  # fmt: skip
 NUMPY_FLOW = dict(
     flow_hidden_dim=np.int64(16), flow_n_layers=np.int64(1), flow_tau_exponent=np.float32(1.5), n_solver_steps=np.int64(3),

@@ -1,13 +1,14 @@
 """Return asked for against return reached: real models, real episodes."""
 
 import re
+import shutil
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 from sb3_dtfm.cli.main import main
-from sb3_dtfm.cli.sweep import Asked, draw, table
+from sb3_dtfm.cli.sweep import Asked, draw, evenly, table
 from tests.recorded import DATASET_ID, tiny_training
 
 SWEEP = ["--env", "HalfCheetah-v5", "--dataset", DATASET_ID, "--episodes", "2", "--env-kwargs", "max_episode_steps:20"]
@@ -25,15 +26,19 @@ def test_two_models_are_asked_for_the_range_of_their_data(workplace, capsys):
     assert len(rows) == 3
     assert all(re.fullmatch(r"\| -?[\d.]+ \|( -?[\d.]+ \[-?[\d.]+, -?[\d.]+\] \|){2}", row) for row in rows)
     assert (workplace / "figures" / "sweep.png").stat().st_size > 10_000
-    assert main(["sweep", runs[1], *SWEEP, "--returns", "1", "2", "-o", "figures/again.png"]) == 0
-    again = [line for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
-    assert [line.split("|")[1].strip() for line in again[2:]] == ["1", "2"]
+    shutil.copy(runs[1], "model.zip")
+    twice = ["model.zip", "model.zip", "--algo", "dtfm"]
+    assert main(["sweep", *twice, *SWEEP, "--returns", "1", "2", "-o", "figures/again.png"]) == 0
+    header, _, *rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+    assert header == "| asked | 1: model.zip | 2: model.zip |"
+    assert [row.split("|")[1].strip() for row in rows] == ["1", "2"]
+    assert all(first == second for _, _, first, second, _ in (row.split("|") for row in rows))
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nowhere.zip", "--algo", "dt", *SWEEP], "nowhere.zip does not exist; expected a model of dt or dtfm"),
+        (["nowhere.zip", "--algo", "dt", *SWEEP], "nowhere.zip does not exist; expected a file that a Stable-Baselines3"),
         (["model.zip", *SWEEP], "model.zip: of which algorithm? Expected a folder dt or dtfm in its path, or --algo."),
         (["dt/model.zip", *SWEEP, "--dataset", "none.npz"], "none.npz does not exist"),
     ],
@@ -42,6 +47,12 @@ def test_what_is_not_there_is_named(arguments, message, workplace, capsys):
     (workplace / "model.zip").touch()
     assert main(["sweep", *arguments]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_returns_to_ask_for_are_those_that_differ():
+    assert evenly(np.array([0.001, 0.013]), 3) == [0.001, 0.007, 0.013]
+    assert evenly(np.array([1.0, 1.0]), 9) == [1.0]
+    assert evenly(np.array([-12.345, 11938.2]), 2) == [-12.35, 11940.0]
 
 
 def test_the_table_and_the_picture_say_what_was_reached(tmp_path, monkeypatch):

@@ -219,7 +219,7 @@ def test_a_cache_gives_the_same_actions_until_the_window_slides(model):
 
 
 def test_a_call_that_fails_leaves_the_cache_as_it_was(model, monkeypatch):
-    model.policy.set_acting(kv_cache=True)
+    model.policy.set_acting(kv_cache=True, n_action_steps=1)
     observation, _ = make_env().reset(seed=0)
     _, state = model.predict(observation, deterministic=True)
     following = {**observation, "timestep": np.array([1])}
@@ -249,7 +249,7 @@ def test_a_cache_that_starts_in_mid_episode_is_filled_from_the_window(model):
             observations["timestep"][:] = [[t], [max(0, t - 2)]]
             _, state = model.predict(observations, state=state, episode_start=np.array([t == 0, t <= 2]), deterministic=True)
         states.append(state)
-    model.policy.set_acting(kv_cache=True)
+    model.policy.set_acting(kv_cache=True, n_action_steps=1)
     observations["timestep"][:] = [[4], [2]]
     for state in states:
         actions.append(model.predict(observations, state=state, episode_start=np.zeros(2, bool), deterministic=True)[0])

@@ -120,6 +120,18 @@ def test_another_number_of_steps_in_mid_episode_begins_a_new_plan(model, asked):
     assert len(asked) == 2
 
 
+def test_without_state_too_when_one_row_asks_again(model):
+    """Rows of the contexts before and after the last call, whose plans were of different lengths."""
+    first, second = observations(2, 2)
+    model.predict(first, deterministic=True)
+    model.policy.set_acting(n_action_steps=1)
+    model.predict(second, deterministic=True)
+    third = {key: np.stack([second[key][0], first[key][1]]) for key in first}
+    third["timestep"] = np.array([[1], [2]])
+    again, _ = model.predict(third, deterministic=True)
+    assert np.isfinite(again).all()
+
+
 def test_a_question_that_is_asked_again_has_the_same_answer(model):
     """Without `state`, at each place in a chunk."""
     model.policy.reset()

@@ -16,7 +16,7 @@ PAPER_REGIMES = (1.0, 0.5)
 N_LATE = 5  # evaluations in the late average
 MEASURES = {"late": "late average", "best": "best evaluation", "final": "final evaluation"}
 THRESHOLD = 0.95  # share of the scale that training takes its minutes to reach
-THRESHOLD_NAME = f"{100 * THRESHOLD:.0f} % of what was recorded"
+THRESHOLD_NAME = f"{100 * THRESHOLD:.0f} % of recorded return, or success"
 OVER_EPISODES, OVER_SEEDS = "95 % interval over episodes", "range over seeds"
 
 
@@ -91,7 +91,7 @@ class Run(NamedTuple):
         """
         if self.threshold is None:
             return None
-        rows = [*self.evaluations, self.final]
+        rows = (row for row in (*self.evaluations, self.final) if row["step"] > 0)
         return next((row["wall_s"] / 60 for row in rows if row_value(row) >= self.threshold), math.inf)
 
     @property

@@ -45,7 +45,7 @@ MINUTES_CAPTION = (
 TO_THRESHOLD = f"minutes to {100 * THRESHOLD:.0f} %"
 TO_THRESHOLD_IS = (
     f"{TO_THRESHOLD.capitalize()}: of training, until an evaluation (the final one counts too) is first at or above "
-    f"{THRESHOLD_NAME}, a mean return, or success of 100 %. Mean over the seeds that got there; no finer than evaluations "
+    f"{THRESHOLD_NAME}. Mean over the seeds that got there; no finer than evaluations "
     "are apart. Compare only minutes of the same machine."
 )
 
