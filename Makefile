@@ -13,7 +13,7 @@ help:
 	@echo "make install  pinned environment in $(VENV), for Python 3.10 to 3.12"
 	@echo "make demo     record, train and evaluate on robosuite's Lift: 6 minutes on 2 cores"
 	@echo "make test     the fast tests"
-	@echo "make bench    DTFM beside d3rlpy, training and acting: 10 minutes on 2 idle cores"
+	@echo "make bench    DT and DTFM beside d3rlpy, training and acting: 15 minutes on 2 idle cores"
 	@echo "make format   rewrite the sources in the project's format"
 	@echo "make lint     check format and style"
 	@echo "make type     check types"

@@ -33,9 +33,7 @@ ACTING = {
     "50 Euler steps": ("euler", 50, 0, 1, 0),
     "one step": ("one_step", 1, 0, 1, 0),
     "50 Euler steps, kv_cache": ("euler", 50, 1, 1, 0),
-    "10 Euler steps, kv_cache": ("euler", 10, 1, 1, 0),
     "one step, kv_cache": ("one_step", 1, 1, 1, 0),
-    "one step, kv_cache, from time step 10,000": ("one_step", 1, 1, 1, 10_000),
     "50 Euler steps, kv_cache, 16 environments": ("euler", 50, 1, 16, 0),
     "one step, kv_cache, 16 environments": ("one_step", 1, 1, 16, 0),
 }
