@@ -225,7 +225,8 @@ def test_without_time_steps_and_with_more_starts(algorithm, policy_kwargs, cheet
     policy_kwargs = {**policy_kwargs, "timestep_embedding": False}
     model = make_model(algorithm, cheetah_buffer, policy_kwargs=policy_kwargs, timestep_exponent=1.5)
     drawn = []
-    model.buffer.windows = lambda ends, length, windows=model.buffer.windows: drawn.append(ends) or windows(ends, length)
+    windows = model.buffer.windows
+    model.buffer.windows = lambda ends, *sizes: drawn.append(ends) or windows(ends, *sizes)
     model.learn(50, log_interval=None).save(tmp_path / "model")
     timesteps = model.buffer.timesteps[th.cat(drawn)]
     (length,) = set(model.buffer.episode_lengths)
