@@ -129,13 +129,11 @@ def sweep(
     reached = []
     for target in targets:
         vec_env.env_method("set_target_return", target)
-        before = progress.n
-        episodes = evaluate(
-            model,
-            vec_env,
-            range(first, first + options.episodes),
-            lambda n_done, before=before: progress.update(before + n_done - progress.n),
-        )
+
+        def count(n_done: int, before: int = progress.n) -> None:
+            progress.update(before + n_done - progress.n)
+
+        episodes = evaluate(model, vec_env, range(first, first + options.episodes), count)
         reached.append(Asked(target, episodes.returns))
     vec_env.close()
     return reached
