@@ -11,7 +11,7 @@ SOURCES := sb3_dtfm envs zoo_configs tests studies
 
 help:
 	@echo "make install  pinned environment in $(VENV), for Python 3.10 to 3.12"
-	@echo "make demo     record, train and evaluate on robosuite's Lift: 6 minutes on 2 cores"
+	@echo "make demo     record, train and evaluate on robosuite's Lift: 5 minutes on 2 cores"
 	@echo "make test     the fast tests"
 	@echo "make bench    DT and DTFM beside d3rlpy, training and acting: 15 minutes on 2 idle cores"
 	@echo "make format   rewrite the sources in the project's format"
