@@ -14,11 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.data import TrajectoryBuffer, load_dataset
-from sb3_dtfm.recording.loading import load_agent
+from sb3_dtfm.recording.loading import algorithm_of, load_agent
 
 N_WINDOWS = 4096
 # So long do the locomotion tasks' agents take to find their gait.
@@ -48,14 +47,6 @@ def share_at_bounds(buffer: TrajectoryBuffer) -> float:
     return float(((actions <= buffer.action_space.low) | (actions >= buffer.action_space.high)).mean())
 
 
-def algorithm_of(path: Path) -> type[BaseAlgorithm]:
-    """The class of a saved model, by the folder it is in."""
-    for part in path.parts:
-        if part in ALGORITHMS:
-            return ALGORITHMS[part]
-    raise SystemExit(f"{path}: of which algorithm? Expected a path with a folder {' or '.join(ALGORITHMS)}.")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", nargs="+", type=Path)
@@ -70,7 +61,7 @@ def main() -> None:
     parts = split(recorded, options.fraction, options.dataset_seed)
     print(f"{options.dataset}: {share_at_bounds(recorded):.1%} of the recorded actions' numbers are at a bound")
     for path in options.models:
-        policy = algorithm_of(path).load(path, device="cpu").policy
+        policy = ALGORITHMS[algorithm_of(path)].load(path, device="cpu").policy
         for name, buffer in parts.items():
             for where, ends in window_ends(buffer).items():
                 batch = buffer.windows(ends, policy.context_length)

@@ -16,8 +16,8 @@ from sb3_dtfm.benchmark.evaluation import SeededEpisodes, evaluate
 from sb3_dtfm.benchmark.report.statistics import Interval, student_t
 from sb3_dtfm.data import load_dataset
 from sb3_dtfm.envs import ReturnToGoWrapper
-from sb3_dtfm.recording.loading import AgentFiles, find_agent, load_agent
-from sb3_dtfm.zoo.arguments import UsageError, key_values
+from sb3_dtfm.recording.loading import AgentFiles, algorithm_of, find_agent, load_agent
+from sb3_dtfm.zoo.arguments import key_values
 
 COLORS = ("#1b6ca8", "#c0562b", "#3f8f5f", "#7b5ea7")
 # First seed of the initial states: apart from those of recordings and benchmarks.
@@ -50,7 +50,7 @@ def main(argv: Sequence[str]) -> None:
     :param argv: its arguments
     """
     options = _parser().parse_args(argv)
-    algorithms = [options.algo or _algorithm_of(model) for model in options.models]
+    algorithms = [options.algo or algorithm_of(model) for model in options.models]
     returns = load_dataset(options.dataset, **key_values("--dataset-kwargs", options.dataset_kwargs)).episode_returns
     agents = [find_agent(model, options.env) for model in options.models]
     models = [load_agent(algo, agent.model, "cpu") for algo, agent in zip(algorithms, agents, strict=True)]
@@ -137,13 +137,6 @@ def sweep(
         reached.append(Asked(target, episodes.returns))
     vec_env.close()
     return reached
-
-
-def _algorithm_of(path: str) -> str:
-    for part in Path(path).parts:
-        if part in ALGORITHMS:
-            return part
-    raise UsageError(f"{path}: of which algorithm? Expected a folder {' or '.join(ALGORITHMS)} in its path, or --algo.")
 
 
 def table(curves: dict[str, list[Asked]]) -> list[str]:

@@ -327,10 +327,8 @@ class SequencePolicy(BasePolicy):
         :param due: (B,) bool, rows that need new actions, b of them
         :return: (b, H, A) in [-1, 1], and the keys and values to keep, which grow with each step, due or not
         """
-        caches, nothing = (
-            self.kv_cache and self.context_length > 1,
-            np.zeros((0, self.chunk_size, self.action_dim), np.float32),
-        )
+        caches = self.kv_cache and self.context_length > 1
+        nothing = np.zeros((0, self.chunk_size, self.action_dim), np.float32)
         keys_values = np.zeros((len(due), 0), np.float32)
         if not caches and not due.any():
             return nothing, keys_values

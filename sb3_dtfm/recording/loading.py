@@ -98,6 +98,19 @@ def known_algorithms() -> dict[str, type[BaseAlgorithm]]:
     return known
 
 
+def algorithm_of(model: str | Path) -> str:
+    """
+    Which of ours a model is, by the folder of RL-Zoo's that it lies in.
+
+    :param model: zip file or run folder, below a folder `dt` or `dtfm`
+    :raises ValueError: there is none
+    """
+    for part in Path(model).parts:
+        if part in ALGORITHMS:
+            return part
+    raise ValueError(f"{model}: of which algorithm? Expected a folder {' or '.join(ALGORITHMS)} in its path, or --algo.")
+
+
 def load_agent(algo: str, model: str | Path, device: str) -> BaseAlgorithm:
     """
     Load an agent to act with.
