@@ -8,20 +8,26 @@ from torch.nn import functional as F
 
 from sb3_dtfm.networks.cpu import Linear
 
+# Lowest and highest frequency in rad: higher ones would change faster than a solver's step can follow.
+TAU_FREQUENCIES = (1.0, 100.0)
+# Higher ones would tell the episodes of one agent apart.
+RETURN_FREQUENCIES = (3.0, 36.0)
+RETURN_EMBEDDING_DIM = 16
 
-def sinusoidal_embedding(tau: th.Tensor, embedding_dim: int) -> th.Tensor:
+
+def sinusoidal_embedding(
+    tau: th.Tensor, embedding_dim: int, frequencies: tuple[float, float] = TAU_FREQUENCIES
+) -> th.Tensor:
     """
-    Sines and cosines of tau at frequencies from 1 to 100 rad, geometrically spaced.
+    Sines and cosines at geometrically spaced frequencies.
 
-    Higher ones would change faster than a solver's step can follow.
-
-    :param tau: (...) in [0, 1]
+    :param tau: (...), about [0, 1]
     :param embedding_dim: even
+    :param frequencies: the lowest and the highest, rad
     :return: (..., embedding_dim)
     """
-    half = embedding_dim // 2
-    frequencies = th.exp(th.linspace(0.0, math.log(100.0), half, device=tau.device))
-    angles = tau.unsqueeze(-1) * frequencies
+    low, high = map(math.log, frequencies)
+    angles = tau.unsqueeze(-1) * th.exp(th.linspace(low, high, embedding_dim // 2, device=tau.device))
     return th.cat((angles.sin(), angles.cos()), dim=-1)
 
 
@@ -78,3 +84,29 @@ class VectorField(FilmNetwork):
     def time_share(self, tau: th.Tensor) -> th.Tensor:
         """The share of times in [0, 1], (...), in all scales and shifts: (..., 2 * hidden_dim * n_layers)."""
         return self.film_time(sinusoidal_embedding(tau, self.time_embedding_dim))
+
+
+class ReturnFilm(nn.Module):
+    """
+    From a return-to-go to scales and shifts for all blocks of a trunk: an MLP of its sines and cosines.
+
+    Scales start apart (standard deviation 0.2 of the last weights), so that returns that differ by a tenth are told apart
+    from the first gradient step on.
+
+    :param embed_dim: width D of the trunk, and of the hidden layer
+    :param n_blocks: number of its blocks
+    """
+
+    def __init__(self, embed_dim: int, n_blocks: int) -> None:
+        super().__init__()
+        self.hidden = Linear(1 + RETURN_EMBEDDING_DIM, embed_dim)
+        self.output = Linear(embed_dim, 2 * embed_dim * n_blocks)
+        nn.init.normal_(self.hidden.weight, std=0.5)
+        nn.init.normal_(self.output.weight, std=0.2)
+        nn.init.zeros_(self.hidden.bias)
+        nn.init.zeros_(self.output.bias)
+
+    def forward(self, returns_to_go: th.Tensor) -> th.Tensor:
+        """From (B, N), scaled, to (B, N, 2 * embed_dim * n_blocks)."""
+        waves = sinusoidal_embedding(returns_to_go, RETURN_EMBEDDING_DIM, RETURN_FREQUENCIES)
+        return self.output(F.silu(self.hidden(th.cat((returns_to_go.unsqueeze(-1), waves), dim=-1))))

@@ -1,10 +1,13 @@
 """The causal Transformer over returns-to-go, observations and actions that `DT` and `DTFM` share."""
 
+from collections.abc import Sequence
+
 import torch as th
 from torch import nn
 from torch.nn import functional as F
 
 from sb3_dtfm.networks.cpu import Linear, dropout, dropout_add
+from sb3_dtfm.networks.film import ReturnFilm
 
 ALL = slice(None)
 
@@ -108,6 +111,8 @@ class SequenceTrunk(nn.Module):
     :param dropout: probability on embeddings, attention weights and residual branches
     :param timestep_embedding: add the embeddings of time steps
     :param tokens_per_step: 3 or 1
+    :param film_return_to_go: scale and shift the tokens before each block by the return-to-go of their step. Added to a
+        token, what is asked for soon drowns in what is seen; a factor decides what the rest is read as
     """
 
     def __init__(
@@ -121,6 +126,7 @@ class SequenceTrunk(nn.Module):
         dropout: float = 0.1,
         timestep_embedding: bool = True,
         tokens_per_step: int = 3,
+        film_return_to_go: bool = False,
     ) -> None:
         super().__init__()
         if embed_dim % n_heads:
@@ -138,6 +144,7 @@ class SequenceTrunk(nn.Module):
         self.blocks = nn.ModuleList(TransformerBlock(embed_dim, n_heads, dropout) for _ in range(n_layers))
         self.final_norm = nn.LayerNorm(embed_dim)
         self.apply(self._initialize)
+        self.film = ReturnFilm(embed_dim, n_layers) if film_return_to_go else None  # which starts in its own way
 
     def _initialize(self, module: nn.Module) -> None:
         """GPT-2's initialisation: normal weights of 0.02, and smaller where residual branches add up."""
@@ -170,9 +177,11 @@ class SequenceTrunk(nn.Module):
         tokens = self._tokens(observations, actions, returns_to_go, timesteps, mask)
         tokens = dropout(tokens, self.dropout, self.training)
         attention_bias = self._attention_bias(mask, tokens.shape[1])
+        films = self._films(returns_to_go)
         *lower_blocks, last_block = self.blocks
-        for block in lower_blocks:
-            tokens = block(tokens, attention_bias)
+        for block, film in zip(lower_blocks, films, strict=False):
+            tokens = block(scale_and_shift(tokens, film), attention_bias)
+        tokens = scale_and_shift(tokens, films[-1])
         return self.final_norm(last_block(tokens, attention_bias, slice(-1, None) if last_only else self.observation_tokens))
 
     def extend(
@@ -200,9 +209,11 @@ class SequenceTrunk(nn.Module):
         newest = (x[:, -2:] for x in (observations, actions, returns_to_go, timesteps, mask))
         tokens = self._tokens(*newest)[:, -self.tokens_per_step :]
         attention_bias = self._attention_bias(mask, keys_values.shape[3])[:, :, -self.tokens_per_step :]
-        for block, block_keys_values in zip(self.blocks, keys_values.unbind(dim=1), strict=True):
+        films = self._films(returns_to_go[:, -2:])
+        for block, film, block_keys_values in zip(self.blocks, films, keys_values.unbind(dim=1), strict=True):
             assert isinstance(block, TransformerBlock)
-            tokens = block.extend(tokens, block_keys_values, attention_bias)
+            newest_film = None if film is None else film[:, -self.tokens_per_step :]
+            tokens = block.extend(scale_and_shift(tokens, newest_film), block_keys_values, attention_bias)
         return self.final_norm(tokens[:, -1])
 
     def n_tokens(self, context_length: int) -> int:
@@ -227,6 +238,15 @@ class SequenceTrunk(nn.Module):
             return return_to_go + observation + F.pad(known, (0, 0, 1, 0))
         return th.stack((return_to_go, observation + time, action + time), dim=2).flatten(1, 2)[:, :-1]
 
+    def _films(self, returns_to_go: th.Tensor) -> Sequence[th.Tensor | None]:
+        """From returns-to-go (B, N) to scales and shifts (B, L, 2 D) of each block's tokens, None where there are none."""
+        if self.film is None:
+            return [None] * self.n_layers
+        films = self.film(returns_to_go)
+        if self.tokens_per_step > 1:
+            films = films.repeat_interleave(self.tokens_per_step, dim=1)[:, :-1]
+        return films.chunk(self.n_layers, dim=-1)
+
     def _time(self, timesteps: th.Tensor) -> th.Tensor:
         """What to add to the tokens of steps (B, N): embeddings (B, N, D), or zeros (B, N, 1) where there are none."""
         if self.embed_timestep is None:
@@ -238,6 +258,20 @@ class SequenceTrunk(nn.Module):
         allowed = causal_mask(mask.repeat_interleave(self.tokens_per_step, dim=1)[:, :n_tokens])
         bias = th.zeros_like(allowed, dtype=self.final_norm.weight.dtype).masked_fill_(~allowed, -th.inf)
         return bias.expand(-1, self.n_heads, -1, -1)
+
+
+def scale_and_shift(tokens: th.Tensor, film: th.Tensor | None) -> th.Tensor:
+    """
+    FiLM (Perez et al., 2018).
+
+    :param tokens: (B, L, D)
+    :param film: (B, L, 2 D), scales less one and shifts; None changes nothing
+    :return: (B, L, D)
+    """
+    if film is None:
+        return tokens
+    scale, shift = film.chunk(2, dim=-1)
+    return th.addcmul(shift, tokens, 1.0 + scale)
 
 
 def causal_mask(valid: th.Tensor) -> th.Tensor:

@@ -21,38 +21,60 @@ class Normalization(nn.Module):
 
     :param observation_dim: O
     :param action_space: bounded Box (A,)
-    :param max_timestep: time steps with a range of return-to-go of their own
+    :param max_timestep: T, the longest episode; time steps with a range of return-to-go of their own
     :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step
+    :param average_return_to_go: divide it by the steps that remain of T (Emmons et al., *RvS*, 2022): what is asked for is
+        then the same number from the first step to the last, and does not run out with the episode
     """
 
     observation_mean: th.Tensor
     observation_std: th.Tensor
+    observation_gain: th.Tensor
     return_scale: th.Tensor
     return_to_go_range: th.Tensor | None
     action_low: th.Tensor
     action_high: th.Tensor
 
-    def __init__(self, observation_dim: int, action_space: spaces.Box, max_timestep: int, clip_return_to_go: bool) -> None:
+    def __init__(
+        self,
+        observation_dim: int,
+        action_space: spaces.Box,
+        max_timestep: int,
+        clip_return_to_go: bool,
+        average_return_to_go: bool = False,
+    ) -> None:
         super().__init__()
         self.max_timestep = max_timestep
+        self.average_return_to_go = average_return_to_go
         self.register_buffer("observation_mean", th.zeros(observation_dim))
         self.register_buffer("observation_std", th.ones(observation_dim))
+        self.register_buffer("observation_gain", th.ones(observation_dim))
         self.register_buffer("return_scale", th.ones(()))
         unlimited = th.tensor([[-th.inf], [th.inf]]).repeat(1, max_timestep) if clip_return_to_go else None
         self.register_buffer("return_to_go_range", unlimited)
         for name, bound in (("action_low", action_space.low), ("action_high", action_space.high)):
             self.register_buffer(name, th.as_tensor(bound, dtype=th.float32), persistent=False)
 
-    def set_statistics(self, observation_mean: np.ndarray, observation_std: np.ndarray, return_scale: float) -> None:
+    def set_statistics(
+        self,
+        observation_mean: np.ndarray,
+        observation_std: np.ndarray,
+        observation_unit: np.ndarray,
+        return_scale: float,
+    ) -> None:
         """
         Take the input normalisation from training data.
 
         :param observation_mean: (O,)
-        :param observation_std: (O,)
+        :param observation_std: (O,), which decides what is clipped
+        :param observation_unit: (O,), not larger: what becomes 1
         :param return_scale: largest absolute return-to-go, environment reward units
         """
+        varies = observation_std > SMALLEST_STD
         self.observation_mean.copy_(th.from_numpy(observation_mean))
-        self.observation_std.copy_(th.from_numpy(np.where(observation_std > SMALLEST_STD, observation_std, 1.0)))
+        self.observation_std.copy_(th.from_numpy(np.where(varies, observation_std, 1.0)))
+        gain = np.divide(observation_std, observation_unit, out=np.ones_like(observation_std), where=varies)
+        self.observation_gain.copy_(th.from_numpy(gain))
         self.return_scale.fill_(return_scale if return_scale > 0 else 1.0)
 
     def set_return_to_go_range(self, limits: th.Tensor) -> None:
@@ -65,17 +87,25 @@ class Normalization(nn.Module):
     def forward(self, windows: Windows) -> Windows:
         """
         :param windows: tensors; observations and returns-to-go as the environment gives them
-        :return: observations normalised and clipped, returns-to-go scaled, the others as they are
+        :return: observations normalised and clipped, returns-to-go scaled to at most about 1, the others as they are
         """
         observations = (windows.observations - self.observation_mean) / self.observation_std
         returns_to_go = windows.returns_to_go
         if self.return_to_go_range is not None:
             low, high = self.return_to_go_range[:, windows.timesteps.clamp(max=self.max_timestep - 1)]
             returns_to_go = returns_to_go.clamp(low, high)
+        if self.average_return_to_go:
+            remaining = (self.max_timestep - windows.timesteps).clamp(min=1)
+            returns_to_go = returns_to_go * (self.max_timestep / remaining)
         return windows._replace(
-            observations=observations.clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP),
+            observations=observations.clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP) * self.observation_gain,
             returns_to_go=returns_to_go / self.return_scale,
         )
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        """torch's, for files from before there was a gain too."""
+        state_dict.setdefault(f"{prefix}observation_gain", th.ones_like(self.observation_gain))
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def scale_action(self, action: Any) -> Any:
         """From the environment's range to [-1, 1], (..., A)."""

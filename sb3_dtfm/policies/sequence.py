@@ -35,6 +35,8 @@ ACCEPTED: dict[str, Rule] = {
     "chunk_size": COUNT,
     "weight_decay": NOT_NEGATIVE,
     "clip_return_to_go": BOOLEAN,
+    "average_return_to_go": BOOLEAN,
+    "film_return_to_go": BOOLEAN,
     "kv_cache": BOOLEAN,
 }
 # What the algorithm gives to the policy by itself; everything else is for `policy_kwargs`.
@@ -77,6 +79,9 @@ class SequencePolicy(BasePolicy):
     :param weight_decay: AdamW's, on weight matrices only
     :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step. Asking for more than
         any episode reached, or falling behind, then stays an input like those the policy learned from
+    :param average_return_to_go: tell the trunk the return-to-go per remaining step of the longest episode instead of the sum
+        (Emmons et al., 2022)
+    :param film_return_to_go: let the return-to-go scale and shift what each block of the trunk gets, besides being a token
     :param ema: keep an exponential moving average of the weights and act with it
     :param kv_cache: act on the keys and values kept of earlier steps instead of recomputing the window: two to three times
         faster, and equal until the window slides (see :meth:`SequenceTrunk.extend`)
@@ -107,6 +112,8 @@ class SequencePolicy(BasePolicy):
         n_action_steps: int | None = None,
         weight_decay: float = 1e-3,
         clip_return_to_go: bool = False,
+        average_return_to_go: bool = False,
+        film_return_to_go: bool = False,
         ema: bool = False,
         kv_cache: bool = False,
         seed: int | None = None,
@@ -128,9 +135,10 @@ class SequencePolicy(BasePolicy):
         self.seed = seed
         self.observation_dim = int(observation_space["observation"].shape[0])  # type: ignore[index]
         self.action_dim = int(action_space.shape[0])
-        self.normalization = Normalization(self.observation_dim, action_space, max_timestep, clip_return_to_go)
+        units = (self.observation_dim, action_space, max_timestep)
+        self.normalization = Normalization(*units, clip_return_to_go, average_return_to_go)
         sizes = (self.observation_dim, self.action_dim, max_timestep, embed_dim, n_layers, n_heads)
-        trunk = SequenceTrunk(*sizes, dropout, timestep_embedding, tokens_per_step)
+        trunk = SequenceTrunk(*sizes, dropout, timestep_embedding, tokens_per_step, film_return_to_go)
         self.network = SequenceNetwork(trunk, self.head_class(embed_dim, self.chunk_size * self.action_dim, **head_options))
         self.ema_network = copy.deepcopy(self.network).requires_grad_(False) if ema else None
         self.optimizer = self._make_optimizer(lr_schedule(1.0))

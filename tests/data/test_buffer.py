@@ -306,6 +306,20 @@ def test_statistics_are_those_of_the_contained_steps(episodes: tuple[int, ...]):
     assert np.float32(statistics.return_scale) == to_go.abs().max().item()
 
 
+def test_a_few_wild_episodes_do_not_set_the_unit():
+    """Eight agents that keep their balance, two that roll: by hand, to a tenth of the standard deviation at least."""
+    steps = np.array([-1.0, 1.0])
+    spreads = [[0.5, 3.0, 0.0], *[[1.0, 3.0, 0.0]] * 7, *[[20.0, 3.0, 0.0]] * 2]
+    trajectories = [make_trajectory(2, observations=steps[:, None] * spread) for spread in spreads]
+    buffer = TrajectoryBuffer.from_trajectories(trajectories, ACTION_SPACE, spaces.Box(-np.inf, np.inf, (3,)))
+    statistics = buffer.statistics()
+    np.testing.assert_allclose(statistics.observation_std, [np.sqrt(80.725), 3.0, 0.0])
+    np.testing.assert_allclose(statistics.observation_unit, [1.0, 3.0, 0.0])
+    assert buffer.select(np.array([0, 8, 9])).statistics().observation_unit[0] == pytest.approx(10.25)
+    wild = buffer.select(np.array([0, 0, 0, 8])).statistics()
+    assert wild.observation_unit[0] == pytest.approx(0.1 * wild.observation_std[0]) == pytest.approx(0.1 * np.sqrt(100.1875))
+
+
 def test_a_buffer_on_its_own_device_stays_as_it_is():
     buffer = make_buffer([3, 2])
     moved = buffer.to("cpu")

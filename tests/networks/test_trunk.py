@@ -8,11 +8,11 @@ from sb3_dtfm.networks.trunk import SequenceTrunk, causal_mask
 B, K, OBSERVATION_DIM, A = 3, 6, 5, 2
 
 
-def make_trunk(tokens_per_step: int, timestep_embedding: bool) -> SequenceTrunk:
+def make_trunk(tokens_per_step: int, timestep_embedding: bool, film_return_to_go: bool = False) -> SequenceTrunk:
     th.manual_seed(0)
     sizes = dict(max_timestep=50, embed_dim=16, n_layers=2, n_heads=2, dropout=0.0)
     options = dict(tokens_per_step=tokens_per_step, timestep_embedding=timestep_embedding)
-    return SequenceTrunk(OBSERVATION_DIM, A, **sizes, **options)
+    return SequenceTrunk(OBSERVATION_DIM, A, **sizes, **options, film_return_to_go=film_return_to_go)
 
 
 @pytest.fixture(params=[3, 1], ids=["3 tokens", "1 token"])
@@ -20,9 +20,9 @@ def tokens_per_step(request) -> int:
     return request.param
 
 
-@pytest.fixture(params=[True, False], ids=["timesteps", "no timesteps"])
+@pytest.fixture(params=[(True, False), (False, False), (False, True)], ids=["timesteps", "no timesteps", "film"])
 def trunk(request, tokens_per_step) -> SequenceTrunk:
-    return make_trunk(tokens_per_step, request.param)
+    return make_trunk(tokens_per_step, *request.param)
 
 
 @pytest.fixture

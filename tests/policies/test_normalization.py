@@ -1,0 +1,61 @@
+"""What becomes of observations and returns-to-go on their way into the network, by hand."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+
+from sb3_dtfm import DT
+from sb3_dtfm.policies.normalization import Normalization
+from sb3_dtfm.windows import Windows
+from tests.conftest import TINY_POLICY
+
+T = 100
+
+
+def make_normalization(**options: bool) -> Normalization:
+    options = {"clip_return_to_go": False, **options}
+    normalization = Normalization(2, spaces.Box(-1.0, 1.0, (1,)), T, **options)
+    normalization.set_statistics(np.array([1.0, 5.0]), np.array([2.0, 0.0]), np.array([0.5, 0.0]), 300.0)
+    return normalization
+
+
+def make_windows(observations: list[float], returns_to_go: float, timestep: int) -> Windows:
+    arrays = (observations, [0.0], returns_to_go, timestep, True)
+    return Windows(*(th.tensor(each)[None, None] for each in arrays))
+
+
+@pytest.mark.parametrize(
+    ("observations", "expected"),
+    [([2.0, 5.0], [2.0, 0.0]), ([-1.0, 6.0], [-4.0, 1.0]), ([100.0, 500.0], [40.0, 10.0])],
+    ids=["a unit is what a calm episode spreads", "a constant keeps its own", "clipped at ten standard deviations"],
+)
+def test_observations_by_hand(observations, expected):
+    normalized = make_normalization()(make_windows(observations, 0.0, 0))
+    assert normalized.observations.flatten().tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("return_to_go", "timestep", "summed", "average"),
+    [(300.0, 0, 1.0, 1.0), (150.0, 50, 0.5, 1.0), (3.0, 99, 0.01, 1.0), (60.0, 80, 0.2, 1.0), (6.0, 140, 0.02, 2.0)],
+    ids=["at the start", "half-way", "last step", "all along the same", "longer than any episode of the data"],
+)
+def test_the_average_return_to_go_by_hand(return_to_go, timestep, summed, average):
+    windows = make_windows([1.0, 5.0], return_to_go, timestep)
+    for options, expected in (({}, summed), ({"average_return_to_go": True}, average)):
+        assert make_normalization(**options)(windows).returns_to_go.item() == pytest.approx(expected)
+
+
+def test_an_average_return_to_go_is_clipped_as_the_sum_is():
+    normalization = make_normalization(average_return_to_go=True, clip_return_to_go=True)
+    limits = th.zeros(2, T)
+    limits[1] = 150.0
+    normalization.set_return_to_go_range(limits)
+    assert normalization(make_windows([1.0, 5.0], 900.0, 50)).returns_to_go.item() == pytest.approx(1.0)
+
+
+def test_weights_from_before_there_were_units_act_as_they_did(cheetah_buffer):
+    model = DT("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=TINY_POLICY, seed=0)
+    weights = {name: value for name, value in model.policy.state_dict().items() if "observation_gain" not in name}
+    model.policy.load_state_dict(weights)
+    assert (model.policy.normalization.observation_gain == 1.0).all()
