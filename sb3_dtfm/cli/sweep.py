@@ -2,6 +2,7 @@
 
 import argparse
 import functools
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +14,7 @@ from tqdm import tqdm
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.evaluation import SeededEpisodes, evaluate
+from sb3_dtfm.benchmark.provenance import commit, versions
 from sb3_dtfm.benchmark.report.statistics import Interval, student_t
 from sb3_dtfm.data import load_dataset
 from sb3_dtfm.envs import ReturnToGoWrapper
@@ -64,7 +66,12 @@ def main(argv: Sequence[str]) -> None:
         names = [f"{i}: {model}" for i, model in enumerate(options.models, 1)]
     curves = dict(zip(names, reached, strict=True))
     print("\n".join(table(curves)))
-    print(f"\nPicture: {draw(curves, returns, Path(options.output), options.env)}")
+    picture = draw(curves, returns, Path(options.output), options.env)
+    numbers = picture.with_suffix(".json")
+    origin = {"task": options.env, "dataset": options.dataset, "first_state": first_state(options), "commit": commit()}
+    asked = {name: [each._asdict() for each in reached] for name, reached in curves.items()}
+    numbers.write_text(json.dumps({**origin, "versions": versions(), "models": asked}, indent=1) + "\n")
+    print(f"\nPicture: {picture}\nReturns of all episodes: {numbers}")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -84,7 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     argument("--n-envs", type=_at_least(1), default=10, metavar="N", help="environments side by side; 10 by default")
     argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="as in train")
     argument("--seed", type=int, default=0, help="of the initial states, the same for each return and model")
-    argument("-o", "--output", default="sweep.png", metavar="FILE", help="PNG to write; sweep.png by default")
+    argument("-o", "--output", default="sweep.png", metavar="FILE", help="PNG to write; sweep.png by default, and beside it sweep.json")
     return parser
 
 
@@ -125,7 +132,7 @@ def sweep(
         wrapper_class=lambda env: SeededEpisodes(wrap(env)),
         env_kwargs={**agent.env_kwargs, **key_values("--env-kwargs", options.env_kwargs)},
     )
-    first = FIRST_STATE + SEED_STRIDE * options.seed
+    first = first_state(options)
     reached = []
     for target in targets:
         vec_env.env_method("set_target_return", target)
@@ -137,6 +144,11 @@ def sweep(
         reached.append(Asked(target, episodes.returns))
     vec_env.close()
     return reached
+
+
+def first_state(options: argparse.Namespace) -> int:
+    """Seed of the first of the episodes' initial states, which follow each other."""
+    return FIRST_STATE + SEED_STRIDE * options.seed
 
 
 def table(curves: dict[str, list[Asked]]) -> list[str]:
