@@ -122,6 +122,8 @@ class Runner:
         command = [*TRAIN, "--algo", job.cell.algo, "--env", job.cell.task, "--seed", str(job.cell.seed)]
         command += ["--conf-file", str(folder / SETTINGS), "--log-folder", str(folder / "logs"), "--eval-freq", "-1"]
         command += ["--verbose", "0", "--device", self.options.device, "--num-threads", str(self._n_threads)]
+        if self.options.gym_packages:
+            command += ["--gym-packages", *self.options.gym_packages]
         environment = {key: value for key, value in os.environ.items() if key not in ("RANK", "WORLD_SIZE")}
         environment["OMP_NUM_THREADS"] = str(self._n_threads)
         # A session of its own: Ctrl-C would have RL-Zoo save the model and end as if all were well.

@@ -7,7 +7,7 @@ from typing import Any
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.grid import N_EVALUATIONS, plan
 from sb3_dtfm.benchmark.runner import run_grid
-from sb3_dtfm.zoo.arguments import UsageError, key_values
+from sb3_dtfm.zoo.arguments import UsageError, import_packages, key_values
 
 EXAMPLES = """\
 examples:
@@ -41,6 +41,7 @@ def benchmark_parser() -> argparse.ArgumentParser:
     grid("--algo", dest="algos", nargs="+", choices=algos, default=algos, help="all by default")
     grid("--seeds", "--seed", type=int, nargs="+", default=[0], metavar="SEED", help="0 by default")
     grid("--profile", default="small", help="small (default), paper, a YAML file, or a folder with dt.yml and dtfm.yml")
+    grid("--gym-packages", nargs="+", default=[], metavar="MODULE", help="to import first: they register tasks")
     grid("--label", default="", help="name of what -params change; part of a cell's identity")
     data = parser.add_argument_group("data").add_argument
     data("--dataset", **several, metavar="TASK=DATASET", help="Minari id, robomimic or .npz file")
@@ -101,5 +102,6 @@ def main(argv: Sequence[str]) -> None:
     :raises SystemExit: with code 1 if a cell failed or was left to another process, 130 if interrupted
     """
     options = parse_arguments(argv)
+    import_packages(options.gym_packages)
     jobs, done = plan(options)
     run_grid(jobs, len(done), options)

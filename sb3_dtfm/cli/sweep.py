@@ -19,7 +19,7 @@ from sb3_dtfm.benchmark.report.statistics import Interval, student_t
 from sb3_dtfm.data import load_dataset
 from sb3_dtfm.envs import ReturnToGoWrapper
 from sb3_dtfm.recording.loading import AgentFiles, algorithm_of, find_agent, load_agent
-from sb3_dtfm.zoo.arguments import key_values
+from sb3_dtfm.zoo.arguments import import_packages, key_values
 
 COLORS = ("#1b6ca8", "#c0562b", "#3f8f5f", "#7b5ea7")
 # First seed of the initial states: apart from those of recordings and benchmarks.
@@ -52,6 +52,7 @@ def main(argv: Sequence[str]) -> None:
     :param argv: its arguments
     """
     options = _parser().parse_args(argv)
+    import_packages(options.gym_packages)
     algorithms = [options.algo or algorithm_of(model) for model in options.models]
     returns = load_dataset(options.dataset, **key_values("--dataset-kwargs", options.dataset_kwargs)).episode_returns
     agents = [find_agent(model, options.env) for model in options.models]
@@ -89,9 +90,16 @@ def _parser() -> argparse.ArgumentParser:
     argument("--points", type=_at_least(2), default=9, metavar="N", help="how many then; 9 by default")
     argument("--episodes", type=_at_least(1), default=10, metavar="N", help="for each return; 10 by default")
     argument("--n-envs", type=_at_least(1), default=10, metavar="N", help="environments side by side; 10 by default")
+    argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="to import first: they register tasks")
     argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="as in train")
     argument("--seed", type=int, default=0, help="of the initial states, the same for each return and model")
-    argument("-o", "--output", default="sweep.png", metavar="FILE", help="PNG to write; sweep.png by default, and beside it sweep.json")
+    argument(
+        "-o",
+        "--output",
+        default="sweep.png",
+        metavar="FILE",
+        help="PNG to write; sweep.png by default, and beside it sweep.json",
+    )
     return parser
 
 

@@ -1,6 +1,7 @@
 """What `sb3-dtfm train` and `enjoy` add to RL-Zoo's own arguments, written in terms of those."""
 
 import argparse
+import importlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,20 @@ def key_values(option: str, texts: Sequence[str]) -> dict[str, Any]:
             raise UsageError(f"{option} {text}: expected key:value with a value in Python ({error}).") from error
         values.update(parsed.values)
     return values
+
+
+def import_packages(modules: Sequence[str]) -> None:
+    """
+    Import what registers tasks, as RL-Zoo's `--gym-packages` does.
+
+    :param modules: dotted names
+    :raises UsageError: there is none of that name
+    """
+    for module in modules:
+        try:
+            importlib.import_module(module)
+        except ModuleNotFoundError as error:
+            raise UsageError(f"--gym-packages {module}: {error}.") from error
 
 
 def train_parser() -> argparse.ArgumentParser:

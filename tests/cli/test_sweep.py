@@ -29,7 +29,10 @@ def test_two_models_are_asked_for_the_range_of_their_data(workplace, capsys):
     assert (workplace / "figures" / "sweep.png").stat().st_size > 10_000
     numbers = json.loads((workplace / "figures" / "sweep.json").read_text())
     assert numbers["task"] == "HalfCheetah-v5"
-    assert [list(numbers["models"]), numbers["commit"][:40].isalnum()] == [["DT, HalfCheetah-v5_1", "DTFM, HalfCheetah-v5"], True]
+    assert [list(numbers["models"]), numbers["commit"][:40].isalnum()] == [
+        ["DT, HalfCheetah-v5_1", "DTFM, HalfCheetah-v5"],
+        True,
+    ]
     means = [f"{np.mean(each['returns']):,.6g}" for each in numbers["models"]["DTFM, HalfCheetah-v5"]]
     assert [row.split("|")[3].split()[0] for row in rows] == means
     shutil.copy(runs[1], "model.zip")

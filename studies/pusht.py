@@ -1,0 +1,64 @@
+"""
+Push-T of gym-pusht (`pip install gym-pusht`) from its state, and the demonstrations of Diffusion Policy (Chi et al., 2023).
+
+    PYTHONPATH=studies python -m pusht pusht_cchi_v7_lowdim.npz pusht.npz
+    PYTHONPATH=studies sb3-dtfm benchmark --gym-packages pusht --env PushT-v0 --profile studies/pusht.yml ...
+
+The block's angle is told by its sine and cosine, since it jumps from 2 pi to 0. A step's reward is by how much the overlap
+with the target surpasses the largest so far: an episode's return is its largest overlap, as a share of the 95 % that count as
+success.
+"""
+
+import os
+import sys
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+EPISODE_STEPS = 300
+
+
+def features(state: np.ndarray) -> np.ndarray:
+    """
+    :param state: (..., 5), pixels and rad: position of the tool, position and angle of the block
+    :return: (..., 6) float32
+    """
+    angle = state[..., 4:]
+    return np.concatenate((state[..., :4], np.sin(angle), np.cos(angle)), axis=-1).astype(np.float32)
+
+
+class LargestOverlap(gym.Wrapper):
+    """Push-T with :func:`features` for observations, and returns that are the largest overlap of the episode."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (6,), np.float32)
+        self.largest = 0.0
+
+    def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        state, info = self.env.reset(**kwargs)
+        self.largest = 0.0
+        return features(state), info
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        state, overlap, terminated, truncated, info = self.env.step(action)
+        gain = max(0.0, float(overlap) - self.largest)
+        self.largest += gain
+        return features(state), gain, terminated, truncated, info
+
+
+def make(**kwargs: Any) -> gym.Env:
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    from gym_pusht.envs import PushTEnv
+
+    return LargestOverlap(PushTEnv(obs_type="state", **kwargs))
+
+
+gym.register("PushT-v0", entry_point=make, max_episode_steps=EPISODE_STEPS)
+
+if __name__ == "__main__":
+    source, target = sys.argv[1:]
+    with np.load(source) as recorded:
+        ends = recorded["episode_ends"]
+        np.savez(target, observations=features(recorded["state"]), actions=recorded["action"], episode_ends=ends)
