@@ -5,8 +5,8 @@ Push-T of gym-pusht (`pip install gym-pusht`) from its state, and the demonstrat
     PYTHONPATH=studies sb3-dtfm benchmark --gym-packages pusht --env PushT-v0 --profile studies/pusht.yml ...
 
 The block's angle is told by its sine and cosine, since it jumps from 2 pi to 0. A step's reward is by how much the overlap
-with the target surpasses the largest so far: an episode's return is its largest overlap, as a share of the 95 % that count as
-success.
+with the target surpasses the largest so far: an episode's return is its largest overlap, as a share of the 95 % that count
+as success.
 """
 
 import os
