@@ -102,11 +102,6 @@ class Normalization(nn.Module):
             returns_to_go=returns_to_go / self.return_scale,
         )
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """torch's, for files from before there was a gain too."""
-        state_dict.setdefault(f"{prefix}observation_gain", th.ones_like(self.observation_gain))
-        super()._load_from_state_dict(state_dict, prefix, *args)
-
     def scale_action(self, action: Any) -> Any:
         """From the environment's range to [-1, 1], (..., A)."""
         return 2.0 * (action - self.action_low) / (self.action_high - self.action_low) - 1.0

@@ -5,10 +5,8 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
-from sb3_dtfm import DT
 from sb3_dtfm.policies.normalization import Normalization
 from sb3_dtfm.windows import Windows
-from tests.conftest import TINY_POLICY
 
 T = 100
 
@@ -52,10 +50,3 @@ def test_an_average_return_to_go_is_clipped_as_the_sum_is():
     limits[1] = 150.0
     normalization.set_return_to_go_range(limits)
     assert normalization(make_windows([1.0, 5.0], 900.0, 50)).returns_to_go.item() == pytest.approx(1.0)
-
-
-def test_weights_from_before_there_were_units_act_as_they_did(cheetah_buffer):
-    model = DT("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=TINY_POLICY, seed=0)
-    weights = {name: value for name, value in model.policy.state_dict().items() if "observation_gain" not in name}
-    model.policy.load_state_dict(weights)
-    assert (model.policy.normalization.observation_gain == 1.0).all()
