@@ -20,7 +20,12 @@ from sb3_dtfm.networks import trunk
 from sb3_dtfm.networks.cpu import dropout
 from tests.conftest import TINY_FLOW_POLICY, TINY_POLICY
 
-ALGORITHMS = {"DT": (DT, TINY_POLICY), "DTFM": (DTFM, {**TINY_FLOW_POLICY, "regression_coef": 0.5})}
+CHUNKS = {"chunk_size": 3, "tokens_per_step": 1, "film_return_to_go": True, "regression_coef": 0.5}
+ALGORITHMS = {
+    "DT": (DT, TINY_POLICY),
+    "DTFM": (DTFM, {**TINY_FLOW_POLICY, "regression_coef": 0.5}),
+    "chunks": (DTFM, {**TINY_FLOW_POLICY, **CHUNKS}),
+}
 N_STEPS = 12
 DOWNLOAD = 4.0  # seconds
 

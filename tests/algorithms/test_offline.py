@@ -347,10 +347,10 @@ class LossCurve(BaseCallback):
         return True
 
 
-def loss_curve(buffer, n_steps=500, tokens_per_step=3, **kwargs):
+def loss_curve(buffer, n_steps=500, trunk=(), **kwargs):
     """Means of 50 losses each."""
     curve = LossCurve()
-    policy_kwargs = dict(TINY_FLOW_POLICY, dropout=0.1, n_layers=1, tokens_per_step=tokens_per_step)
+    policy_kwargs = dict(TINY_FLOW_POLICY, dropout=0.1, n_layers=1, **dict(trunk))
     make_model(DTFM, buffer, policy_kwargs=policy_kwargs, learning_rate=1e-3, **kwargs).learn(n_steps, curve, None)
     return np.diff(curve.losses, prepend=0.0).reshape(-1, 50).mean(axis=1)
 
@@ -372,7 +372,11 @@ def plain_attention(query, key, value, bias, dropout_p):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tokens_per_step", [3, 1])
-def test_a_compiled_loss_learns_as_the_plain_one_does(tokens_per_step, cheetah_buffer):
-    compiled, plain = (loss_curve(cheetah_buffer, 100, tokens_per_step, compile=each) for each in (True, False))
+@pytest.mark.parametrize(
+    "trunk",
+    [{}, {"tokens_per_step": 1}, {"tokens_per_step": 1, "chunk_size": 4, "film_return_to_go": True}],
+    ids=["three tokens", "one token", "chunks and FiLM"],
+)
+def test_a_compiled_loss_learns_as_the_plain_one_does(trunk, cheetah_buffer):
+    compiled, plain = (loss_curve(cheetah_buffer, 100, trunk, compile=each) for each in (True, False))
     assert np.abs(compiled / plain - 1.0).max() < 0.1
