@@ -10,8 +10,8 @@ from sb3_dtfm.networks.cpu import Linear
 
 # Lowest and highest frequency in rad: higher ones would change faster than a solver's step can follow.
 TAU_FREQUENCIES = (1.0, 100.0)
-# Higher ones would tell the episodes of one agent apart.
-RETURN_FREQUENCIES = (3.0, 36.0)
+# Higher ones tell the episodes of one agent apart, and each is then learned for itself.
+RETURN_FREQUENCIES = (1.0, 8.0)
 RETURN_EMBEDDING_DIM = 16
 
 
