@@ -25,6 +25,7 @@ class Normalization(nn.Module):
     :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step
     :param average_return_to_go: divide it by the steps that remain of T (Emmons et al., *RvS*, 2022): what is asked for is
         then the same number from the first step to the last, and does not run out with the episode
+    :param calm_units: what calm episodes spread becomes 1, instead of the standard deviation over all
     """
 
     observation_mean: th.Tensor
@@ -42,10 +43,12 @@ class Normalization(nn.Module):
         max_timestep: int,
         clip_return_to_go: bool,
         average_return_to_go: bool = False,
+        calm_units: bool = False,
     ) -> None:
         super().__init__()
         self.max_timestep = max_timestep
         self.average_return_to_go = average_return_to_go
+        self.calm_units = calm_units
         self.register_buffer("observation_mean", th.zeros(observation_dim))
         self.register_buffer("observation_std", th.ones(observation_dim))
         self.register_buffer("observation_gain", th.ones(observation_dim))
@@ -66,15 +69,16 @@ class Normalization(nn.Module):
         Take the input normalisation from training data.
 
         :param observation_mean: (O,)
-        :param observation_std: (O,), which decides what is clipped
-        :param observation_unit: (O,), not larger: what becomes 1
+        :param observation_std: (O,), which decides what is clipped, and becomes 1
+        :param observation_unit: (O,), not larger: what becomes 1 with `calm_units`
         :param return_scale: largest absolute return-to-go, environment reward units
         """
         varies = observation_std > SMALLEST_STD
         self.observation_mean.copy_(th.from_numpy(observation_mean))
         self.observation_std.copy_(th.from_numpy(np.where(varies, observation_std, 1.0)))
-        gain = np.divide(observation_std, observation_unit, out=np.ones_like(observation_std), where=varies)
-        self.observation_gain.copy_(th.from_numpy(gain))
+        if self.calm_units:
+            gain = np.divide(observation_std, observation_unit, out=np.ones_like(observation_std), where=varies)
+            self.observation_gain.copy_(th.from_numpy(gain))
         self.return_scale.fill_(return_scale if return_scale > 0 else 1.0)
 
     def set_return_to_go_range(self, limits: th.Tensor) -> None:

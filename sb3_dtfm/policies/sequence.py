@@ -37,6 +37,7 @@ ACCEPTED: dict[str, Rule] = {
     "clip_return_to_go": BOOLEAN,
     "average_return_to_go": BOOLEAN,
     "film_return_to_go": BOOLEAN,
+    "calm_units": BOOLEAN,
     "kv_cache": BOOLEAN,
 }
 # What the algorithm gives to the policy by itself; everything else is for `policy_kwargs`.
@@ -82,6 +83,8 @@ class SequencePolicy(BasePolicy):
     :param average_return_to_go: tell the trunk the return-to-go per remaining step of the longest episode instead of the sum
         (Emmons et al., 2022)
     :param film_return_to_go: let the return-to-go scale and shift what each block of the trunk gets, besides being a token
+    :param calm_units: scale observations by what calm episodes spread, for data in which some agents' spread far wider; see
+        :meth:`EpisodeTable.statistics`
     :param ema: keep an exponential moving average of the weights and act with it
     :param kv_cache: act on the keys and values kept of earlier steps instead of recomputing the window: two to three times
         faster, and equal until the window slides (see :meth:`SequenceTrunk.extend`)
@@ -114,6 +117,7 @@ class SequencePolicy(BasePolicy):
         clip_return_to_go: bool = False,
         average_return_to_go: bool = False,
         film_return_to_go: bool = False,
+        calm_units: bool = False,
         ema: bool = False,
         kv_cache: bool = False,
         seed: int | None = None,
@@ -136,7 +140,7 @@ class SequencePolicy(BasePolicy):
         self.observation_dim = int(observation_space["observation"].shape[0])  # type: ignore[index]
         self.action_dim = int(action_space.shape[0])
         units = (self.observation_dim, action_space, max_timestep)
-        self.normalization = Normalization(*units, clip_return_to_go, average_return_to_go)
+        self.normalization = Normalization(*units, clip_return_to_go, average_return_to_go, calm_units)
         sizes = (self.observation_dim, self.action_dim, max_timestep, embed_dim, n_layers, n_heads)
         trunk = SequenceTrunk(*sizes, dropout, timestep_embedding, tokens_per_step, film_return_to_go)
         self.network = SequenceNetwork(trunk, self.head_class(embed_dim, self.chunk_size * self.action_dim, **head_options))

@@ -95,4 +95,5 @@ def _sample_trunk(trial: optuna.Trial) -> dict[str, Any]:
         "clip_return_to_go": trial.suggest_categorical("clip_return_to_go", [True, False]),
         "average_return_to_go": trial.suggest_categorical("average_return_to_go", [True, False]),
         "film_return_to_go": trial.suggest_categorical("film_return_to_go", [True, False]),
+        "calm_units": trial.suggest_categorical("calm_units", [True, False]),
     }

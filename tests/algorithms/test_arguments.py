@@ -40,6 +40,7 @@ REFUSED_OF_THE_POLICY = {
     "clip_return_to_go": ("no", None),
     "average_return_to_go": ("no", 1),
     "film_return_to_go": ("no", None),
+    "calm_units": ("no", 1),
     "kv_cache": ("no", 1),
 }
 REFUSED_OF_THE_FLOW = {
@@ -145,6 +146,7 @@ def test_an_unknown_argument_of_the_policy_is_refused_with_those_accepted(algori
         "n_action_steps",
         "average_return_to_go",
         "film_return_to_go",
+        "calm_units",
     }
     flow = {"flow_hidden_dim", "flow_n_layers", "flow_prediction", "solver", "n_solver_steps", "regression_coef"}
     words = re.findall(r"\w+", str(refusal.value).partition("accepted")[2])
@@ -161,6 +163,7 @@ NUMPY_POLICY = dict(
     embed_dim=np.int64(16), n_layers=np.int64(1), n_heads=np.int32(2), dropout=np.float32(0.1),
     timestep_embedding=np.False_, tokens_per_step=np.int64(1), kv_cache=np.True_,
     chunk_size=np.int64(3), n_action_steps=np.int64(2), average_return_to_go=np.True_, film_return_to_go=np.True_,
+    calm_units=np.True_,
 )  # fmt: skip
 NUMPY_FLOW = dict(
     flow_hidden_dim=np.int64(16), flow_n_layers=np.int64(1), flow_tau_exponent=np.float32(1.5), n_solver_steps=np.int64(3),

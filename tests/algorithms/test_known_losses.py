@@ -40,7 +40,6 @@ def test_the_same_batches_and_noise_give_the_losses_of_before(algorithm):
         policy_kwargs={**TRUNK, **HEADS[algorithm]}, seed=0, device="cpu",
     )  # fmt: skip
     policy, generator = model.policy, th.Generator().manual_seed(1)
-    policy.normalization.observation_gain.fill_(1.0)  # which was not there
     ends = th.randint(len(model.buffer), (30, 64), generator=generator)
     losses = []
     for batch in (model.buffer.windows(each, 5) for each in ends):

@@ -50,6 +50,7 @@ def test_two_models_are_asked_for_the_range_of_their_data(workplace, capsys):
         (["nowhere.zip", "--algo", "dt", *SWEEP], "nowhere.zip does not exist; expected a file that a Stable-Baselines3"),
         (["model.zip", *SWEEP], "model.zip: of which algorithm? Expected a folder dt or dtfm in its path, or --algo."),
         (["dt/model.zip", *SWEEP, "--dataset", "none.npz"], "none.npz does not exist"),
+        (["dt/model.zip", *SWEEP, "--gym-packages", "no_tasks"], "--gym-packages no_tasks: No module named 'no_tasks'"),
     ],
 )
 def test_what_is_not_there_is_named(arguments, message, workplace, capsys):

@@ -12,7 +12,7 @@ T = 100
 
 
 def make_normalization(**options: bool) -> Normalization:
-    options = {"clip_return_to_go": False, **options}
+    options = {"clip_return_to_go": False, "calm_units": True, **options}
     normalization = Normalization(2, spaces.Box(-1.0, 1.0, (1,)), T, **options)
     normalization.set_statistics(np.array([1.0, 5.0]), np.array([2.0, 0.0]), np.array([0.5, 0.0]), 300.0)
     return normalization
@@ -50,3 +50,8 @@ def test_an_average_return_to_go_is_clipped_as_the_sum_is():
     limits[1] = 150.0
     normalization.set_return_to_go_range(limits)
     assert normalization(make_windows([1.0, 5.0], 900.0, 50)).returns_to_go.item() == pytest.approx(1.0)
+
+
+def test_the_unit_is_the_standard_deviation_unless_asked_for():
+    normalized = make_normalization(calm_units=False)(make_windows([2.0, 6.0], 0.0, 0))
+    assert normalized.observations.flatten().tolist() == [0.5, 1.0]
