@@ -7,6 +7,9 @@ Push-T of gym-pusht (`pip install gym-pusht`) from its state, and the demonstrat
 The block's angle is told by its sine and cosine, since it jumps from 2 pi to 0. A step's reward is by how much the overlap
 with the target surpasses the largest so far: an episode's return is its largest overlap, as a share of the 95 % that count
 as success.
+
+Walls and target stay where they are when the scene is mirrored at the target's axis, and so does the task: each demonstration
+is written as it was recorded and mirrored.
 """
 
 import os
@@ -17,6 +20,7 @@ import gymnasium as gym
 import numpy as np
 
 EPISODE_STEPS = 300
+SIZE = 512  # pixels of the square; the target's axis is the diagonal on which x + y is as much
 
 
 def features(state: np.ndarray) -> np.ndarray:
@@ -26,6 +30,15 @@ def features(state: np.ndarray) -> np.ndarray:
     """
     angle = state[..., 4:]
     return np.concatenate((state[..., :4], np.sin(angle), np.cos(angle)), axis=-1).astype(np.float32)
+
+
+def mirrored(state: np.ndarray) -> np.ndarray:
+    """
+    :param state: (..., 5), pixels and rad, or only the tool's position, (..., 2)
+    :return: the same of the scene mirrored at the target's axis
+    """
+    positions = [SIZE - state[..., i : i + 2][..., ::-1] for i in range(0, state.shape[-1] - 1, 2)]
+    return np.concatenate((*positions, np.pi / 2 - state[..., 4:]), axis=-1)
 
 
 class LargestOverlap(gym.Wrapper):
@@ -60,5 +73,10 @@ gym.register("PushT-v0", entry_point=make, max_episode_steps=EPISODE_STEPS)
 if __name__ == "__main__":
     source, target = sys.argv[1:]
     with np.load(source) as recorded:
-        ends = recorded["episode_ends"]
-        np.savez(target, observations=features(recorded["state"]), actions=recorded["action"], episode_ends=ends)
+        states, actions, ends = recorded["state"], recorded["action"], recorded["episode_ends"]
+    np.savez(
+        target,
+        observations=features(np.concatenate((states, mirrored(states)))),
+        actions=np.concatenate((actions, mirrored(actions))),
+        episode_ends=np.concatenate((ends, ends[-1] + ends)),
+    )

@@ -42,6 +42,7 @@ ACCEPTED: dict[str, Rule] = {
     "dataset_fraction": Number(low=0, high=1, above_low=True),
     "dataset_seed": Number(low=0, whole=True),
     "timestep_exponent": POSITIVE,
+    "return_weight": NOT_NEGATIVE,
     "max_grad_norm": NOT_NEGATIVE._replace(optional=True),
     "warmup_steps": Number(low=0, whole=True),
     "learning_rate_schedule": Choice(LEARNING_RATE_SCHEDULES),
@@ -68,6 +69,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
     :param dataset_seed: seed of that draw alone, so that different runs learn from the same episodes
     :param timestep_exponent: e of the time step T u^e at which windows end in an episode of T steps, for u uniform in
         [0, 1]: above 1 an episode's start, of which there is little in long episodes, is learned from more often
+    :param return_weight: w: of mixed data, a step of the best episode is learned from 1 + w times as often as one of the
+        worst, and others by their returns in between (Yue et al., 2022); 0 learns from all alike
     :param dataset_kwargs: further arguments of :func:`~sb3_dtfm.data.load_dataset`: `{"cache_dir": folder}` for datasets
         larger than memory, `{"env_id": id}` for data that were recorded under another environment's name, and the
         reader's own, for example `{"filter_key": "train"}` for robomimic
@@ -103,6 +106,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         dataset_fraction: float = 1.0,
         dataset_seed: int = 0,
         timestep_exponent: float = 1.0,
+        return_weight: float = 0.0,
         dataset_kwargs: dict[str, Any] | None = None,
         max_grad_norm: float | None = None,
         warmup_steps: int = 0,
@@ -138,6 +142,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         self.dataset_fraction = dataset_fraction
         self.dataset_seed = dataset_seed
         self.timestep_exponent = timestep_exponent
+        self.return_weight = return_weight
         self.dataset_kwargs = dataset_kwargs
         self.max_grad_norm = max_grad_norm
         self.warmup_steps = warmup_steps

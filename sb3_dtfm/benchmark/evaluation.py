@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_dtfm.benchmark import provenance
 from sb3_dtfm.benchmark.rows import Row, write_row
+from sb3_dtfm.recording.episodes import reported_success
 
 # First seeds of the two sets of initial states: apart from each other, and from those of recordings, which count from 0.
 TRAINING_STATES = 1_000_000
@@ -107,15 +108,13 @@ def evaluate(
         returns, lengths = returns + rewards, lengths + 1
         for i in np.flatnonzero(starts):
             if playing[i] < n_episodes:
-                # SB3's name of it, or that of gymnasium-robotics' mazes and hands
-                success = infos[i].get("is_success", infos[i].get("success"))
-                results[int(playing[i])] = (round(float(returns[i]), 4), int(lengths[i]), success)
+                results[int(playing[i])] = (round(float(returns[i]), 4), int(lengths[i]), reported_success(infos[i]))
             playing[i] += n_envs
         returns[starts], lengths[starts] = 0.0, 0
         if after_step is not None:
             after_step(len(results))
     all_returns, all_lengths, successes = map(list, zip(*(results[episode] for episode in range(n_episodes)), strict=True))
-    return Episodes(all_returns, all_lengths, None if None in successes else [bool(success) for success in successes])
+    return Episodes(all_returns, all_lengths, None if None in successes else successes)
 
 
 class EvaluationCallback(BaseCallback):

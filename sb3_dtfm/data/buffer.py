@@ -264,6 +264,7 @@ class TrajectoryBuffer:
         generator: th.Generator,
         timestep_exponent: float = 1.0,
         n_ahead: int = 0,
+        return_weight: float = 0.0,
     ) -> Iterator[Windows]:
         """
         Endless batches of windows, each drawn before the one before it is handed out.
@@ -276,11 +277,14 @@ class TrajectoryBuffer:
         :param timestep_exponent: e of the time step T u^e in an episode of T steps, for u uniform in [0, 1]; 1 draws any
             step of any episode with equal probability
         :param n_ahead: see :meth:`windows`
+        :param return_weight: w: a step of an episode of return R is drawn 1 + w (R - Rmin) / (Rmax - Rmin) times as often as
+            one of the worst episode (Yue et al., 2022)
         """
+        weights = self._episode_weights(return_weight).to(generator.device) if return_weight > 0 else None
 
         def ends() -> Iterator[th.Tensor]:
             while True:
-                drawn = self._draw(batch_size, generator, timestep_exponent)
+                drawn = self._draw(batch_size, generator, timestep_exponent, weights)
                 self._prefetch(drawn, context_length, n_ahead)
                 yield drawn
 
@@ -297,14 +301,28 @@ class TrajectoryBuffer:
         """
         return self.windows(self._draw(batch_size, generator), context_length)
 
-    def _draw(self, batch_size: int, generator: th.Generator | None, timestep_exponent: float = 1.0) -> th.Tensor:
+    def _episode_weights(self, return_weight: float) -> th.Tensor:
+        """(E,) float32, with what probability an episode is drawn, up to a factor: by its length and its return."""
+        returns = self.episodes.returns - self.episodes.returns.min()
+        return th.from_numpy(self.episodes.lengths * (1.0 + return_weight * returns / (returns.max() or 1.0))).float()
+
+    def _draw(
+        self,
+        batch_size: int,
+        generator: th.Generator | None,
+        timestep_exponent: float = 1.0,
+        episode_weights: th.Tensor | None = None,
+    ) -> th.Tensor:
         """Ends of windows as for :meth:`windows`, drawn where the generator is; see :meth:`batches`."""
         device = self.device if generator is None else generator.device
-        positions = th.randint(len(self), (batch_size,), generator=generator, device=device).to(self._stops.device)
-        if timestep_exponent == 1.0:
-            return positions
+        if episode_weights is not None:
+            episodes = th.multinomial(episode_weights, batch_size, True, generator=generator).to(self._stops.device)
+        else:
+            positions = th.randint(len(self), (batch_size,), generator=generator, device=device).to(self._stops.device)
+            if timestep_exponent == 1.0:
+                return positions
+            episodes = th.searchsorted(self._stops, positions, right=True)
         u = th.rand(batch_size, generator=generator, device=device).to(self._stops.device)
-        episodes = th.searchsorted(self._stops, positions, right=True)
         firsts, lasts = self._firsts[episodes], self._stops[episodes] - 1
         timesteps = ((lasts + 1 - firsts) * u**timestep_exponent).long()
         return th.minimum(firsts + timesteps, lasts)  # a product may round to T

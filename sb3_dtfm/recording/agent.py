@@ -149,12 +149,16 @@ def agent_actions(model: BaseAlgorithm, normalizer: VecNormalize | None, determi
 
 
 def show_progress(episodes: Iterator[RecordedEpisode], n_episodes: int, progress: bool) -> Iterator[RecordedEpisode]:
-    """Pass episodes on under a progress bar with their mean return."""
-    total_return = 0.0
+    """Pass episodes on under a progress bar with their mean return, and the share of successes where that is told."""
+    total_return, n_successes = 0.0, 0
     with tqdm(total=n_episodes, unit="episode", disable=not progress) as bar:
         for number, episode in enumerate(episodes, start=1):
             total_return += sum(episode.rewards)
-            bar.set_postfix(mean_return=f"{total_return / number:.1f}", refresh=False)
+            shown = {"mean_return": f"{total_return / number:.1f}"}
+            if episode.success is not None:
+                n_successes += episode.success
+                shown["success"] = f"{n_successes / number:.0%}"
+            bar.set_postfix(shown, refresh=False)
             bar.update()
             yield episode
 

@@ -25,6 +25,7 @@ class RecordedEpisode:
     :param rewards: T numbers, environment reward units
     :param terminated: ended in a terminal state
     :param truncated: ended at a time limit
+    :param success: what the environment said at the last step; None where it says nothing
     :param states: T arrays (S,), the simulator's state before each action; empty unless asked for
     :param model_file: XML of the simulated scene; empty unless asked for
     """
@@ -35,6 +36,7 @@ class RecordedEpisode:
     rewards: list[float] = field(default_factory=list)
     terminated: bool = False
     truncated: bool = False
+    success: bool | None = None
     states: list[np.ndarray] = field(default_factory=list)
     model_file: str = ""
 
@@ -72,7 +74,14 @@ class EpisodeRecorder(gym.Wrapper):
         episode.observations.append(copy.deepcopy(observation))
         episode.rewards.append(float(reward))
         episode.terminated, episode.truncated = bool(terminated), bool(truncated)
+        episode.success = reported_success(info)
         return observation, reward, terminated, truncated, info
+
+
+def reported_success(info: dict[str, Any]) -> bool | None:
+    """What a step's `info` says: by SB3's name of it, or that of gymnasium-robotics' mazes and hands; None for nothing."""
+    success = info.get("is_success", info.get("success"))
+    return None if success is None else bool(success)
 
 
 def run_episodes(envs: Sequence[gym.Env], act: ActFunction, seeds: Sequence[int]) -> Iterator[RecordedEpisode]:

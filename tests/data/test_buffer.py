@@ -100,17 +100,36 @@ def test_windows_end_near_an_episode_s_start_as_often_as_the_exponent_says():
             assert np.mean(timesteps < share * length) == pytest.approx(share**0.5, abs=0.02)
 
 
+@pytest.mark.parametrize("timestep_exponent", [1.0, 2.0])
+def test_better_episodes_are_drawn_more_often_by_the_weight_of_their_returns(timestep_exponent: float):
+    """Steps of returns -10, 0 and 10 are drawn as 1 to 3.5 to 6; of equal returns, alike."""
+    lengths, returns, n_draws = np.array([100, 300, 50]), np.array([0.0, 10.0, -10.0]), 40_000
+    buffer = make_buffer(list(lengths))
+    buffer.observations[:, 0] = th.arange(3).repeat_interleave(th.from_numpy(lengths))
+
+    def shares(returns: np.ndarray) -> np.ndarray:
+        buffer.episodes = buffer.episodes._replace(returns=returns)
+        generator = th.Generator().manual_seed(5)
+        batch = next(buffer.batches(n_draws, 1, generator, timestep_exponent, return_weight=5.0))
+        assert batch.timesteps.max() == 299
+        return np.bincount(batch.observations[:, 0, 0].long().numpy()) / n_draws
+
+    weights = lengths * np.array([3.5, 6.0, 1.0])
+    assert shares(returns) == pytest.approx(weights / weights.sum(), abs=0.01)
+    assert shares(np.full(3, 7.0)) == pytest.approx(lengths / 450, abs=0.01)
+
+
 def test_sampling_repeats_with_the_same_seed():
     buffer = make_buffer([10, 10])
     first, second = (buffer.sample(32, 5, th.Generator().manual_seed(3)) for _ in range(2))
     assert all(th.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
-@pytest.mark.parametrize("timestep_exponent", [1.0, 2.0])
-def test_batches_differ_repeat_with_the_same_seed_and_have_no_end(timestep_exponent: float):
+@pytest.mark.parametrize("choices", [{}, {"timestep_exponent": 2.0}, {"return_weight": 5.0}], ids=str)
+def test_batches_differ_repeat_with_the_same_seed_and_have_no_end(choices: dict[str, float]):
     buffer = make_buffer([10, 10])
     first, second = (
-        list(itertools.islice(buffer.batches(32, 5, th.Generator().manual_seed(3), timestep_exponent), 50)) for _ in range(2)
+        list(itertools.islice(buffer.batches(32, 5, th.Generator().manual_seed(3), **choices), 50)) for _ in range(2)
     )
     for ours, theirs in zip(first, second, strict=True):
         assert all(th.equal(a, b) for a, b in zip(ours, theirs, strict=True))
