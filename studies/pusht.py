@@ -8,8 +8,8 @@ The block's angle is told by its sine and cosine, since it jumps from 2 pi to 0.
 with the target surpasses the largest so far: an episode's return is its largest overlap, as a share of the 95 % that count
 as success.
 
-Walls and target stay where they are when the scene is mirrored at the target's axis, and so does the task: each demonstration
-is written as it was recorded and mirrored.
+Walls and target stay where they are when the scene is mirrored at the target's axis, and so does the task: demonstrations
+are written as they were recorded, and mirrored.
 """
 
 import os
