@@ -2,6 +2,7 @@
 
 import gymnasium as gym
 import numpy as np
+import pytest
 from gymnasium import spaces
 
 from sb3_dtfm.recording.episodes import EpisodeRecorder, run_episodes
@@ -71,3 +72,11 @@ def test_an_episode_that_a_wrapper_ends_is_truncated():
 def test_episodes_come_in_the_order_of_their_seeds():
     episodes, _ = run(limit=5, seeds=(3, 1, 4, 1, 5))
     assert [episode.seed for episode in episodes] == [3, 1, 4, 1, 5]
+
+
+@pytest.mark.parametrize(("env_id", "success"), [("AdroitHandDoor-v1", False), ("HalfCheetah-v5", None)])
+def test_success_is_what_the_environment_says_or_nothing(env_id: str, success: bool | None):
+    with EpisodeRecorder(gym.make(env_id, max_episode_steps=2)) as env:
+        (episode,) = run_episodes([env], lambda _, __, numbers: np.zeros((len(numbers), *env.action_space.shape)), [0])
+    assert episode.truncated
+    assert episode.success is success
