@@ -19,7 +19,7 @@ from sb3_dtfm.benchmark.report.statistics import Interval, student_t
 from sb3_dtfm.data import load_dataset
 from sb3_dtfm.envs import ReturnToGoWrapper
 from sb3_dtfm.recording.loading import AgentFiles, algorithm_of, find_agent, load_agent
-from sb3_dtfm.zoo.arguments import import_packages, key_values
+from sb3_dtfm.zoo.arguments import UsageError, import_packages, key_values
 
 COLORS = ("#1b6ca8", "#c0562b", "#3f8f5f", "#7b5ea7")
 # First seed of the initial states: apart from those of recordings and benchmarks.
@@ -57,6 +57,9 @@ def main(argv: Sequence[str]) -> None:
     returns = load_dataset(options.dataset, **key_values("--dataset-kwargs", options.dataset_kwargs)).episode_returns
     agents = [find_agent(model, options.env) for model in options.models]
     models = [load_agent(algo, agent.model, "cpu") for algo, agent in zip(algorithms, agents, strict=True)]
+    acting = key_values("--acting", options.acting)
+    for model in models:
+        set_acting(model, acting)
     targets = options.returns or evenly(returns, options.points)
     reached = []
     with tqdm(total=len(models) * len(targets) * options.episodes, unit="episode", disable=None) as progress:
@@ -69,7 +72,8 @@ def main(argv: Sequence[str]) -> None:
     print("\n".join(table(curves)))
     picture = draw(curves, returns, Path(options.output), options.env)
     numbers = picture.with_suffix(".json")
-    origin = {"task": options.env, "dataset": options.dataset, "first_state": first_state(options), "commit": commit()}
+    origin = {"task": options.env, "dataset": options.dataset, "first_state": first_state(options), "acting": acting}
+    origin["commit"] = commit()
     asked = {name: [each._asdict() for each in reached] for name, reached in curves.items()}
     numbers.write_text(json.dumps({**origin, "versions": versions(), "models": asked}, indent=1) + "\n")
     print(f"\nPicture: {picture}\nReturns of all episodes: {numbers}")
@@ -90,6 +94,9 @@ def _parser() -> argparse.ArgumentParser:
     argument("--points", type=_at_least(2), default=9, metavar="N", help="how many then; 9 by default")
     argument("--episodes", type=_at_least(1), default=10, metavar="N", help="for each return; 10 by default")
     argument("--n-envs", type=_at_least(1), default=10, metavar="N", help="environments side by side; 10 by default")
+    argument(
+        "--acting", nargs="+", default=[], metavar="KEY:VALUE", help="for example n_solver_steps:10; as saved by default"
+    )
     argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="to import first: they register tasks")
     argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="as in train")
     argument("--seed", type=int, default=0, help="of the initial states, the same for each return and model")
@@ -101,6 +108,18 @@ def _parser() -> argparse.ArgumentParser:
         help="PNG to write; sweep.png by default, and beside it sweep.json",
     )
     return parser
+
+
+def set_acting(model: BaseAlgorithm, choices: dict[str, Any]) -> None:
+    """
+    :param model: DT or DTFM
+    :param choices: of :meth:`SequencePolicy.set_acting`, for all models
+    :raises UsageError: one that the model does not have, or a value out of range
+    """
+    try:
+        model.policy.set_acting(**choices)  # type: ignore[operator]
+    except ValueError as error:
+        raise UsageError(f"--acting: {error}") from error
 
 
 def _at_least(low: int) -> Any:

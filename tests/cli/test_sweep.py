@@ -42,6 +42,18 @@ def test_two_models_are_asked_for_the_range_of_their_data(workplace, capsys):
     assert header == "| asked | 1: model.zip | 2: model.zip |"
     assert [row.split("|")[1].strip() for row in rows] == ["1", "2"]
     assert all(first == second for _, _, first, second, _ in (row.split("|") for row in rows))
+    assert json.loads((workplace / "figures" / "again.json").read_text())["acting"] == {}
+    slower = [*twice, *SWEEP, "--returns", "1", "-o", "figures/slower.png", "--acting"]
+    assert main(["sweep", *slower, "n_solver_steps:7"]) == 0
+    (asked, _) = json.loads((workplace / "figures" / "slower.json").read_text())["models"].values()
+    (as_saved, _) = json.loads((workplace / "figures" / "again.json").read_text())["models"].values()
+    assert asked[0]["target"] == as_saved[0]["target"]
+    assert asked[0]["returns"] != as_saved[0]["returns"]
+    assert main(["sweep", *slower, "n_solver_steps:0"]) == 2
+    assert main(["sweep", *slower, "speed:7"]) == 2
+    errors = capsys.readouterr().err
+    assert "--acting: n_solver_steps" in errors
+    assert "--acting: speed: no way of acting; accepted are kv_cache, n_action_steps, solver, n_solver_steps." in errors
 
 
 @pytest.mark.parametrize(
