@@ -37,7 +37,7 @@ ROOMS = {
         },
     ),
     "zoo": ("sb3_dtfm/zoo", {"", "algorithms", "policies", "callbacks", "envs", "distributed", "zoo"}),
-    "benchmark": ("sb3_dtfm/benchmark", {"", "algorithms", "data", "zoo", "benchmark"}),
+    "benchmark": ("sb3_dtfm/benchmark", {"", "algorithms", "data", "envs", "zoo", "benchmark"}),
     "cli": ("sb3_dtfm/cli", {"", "algorithms", "data", "envs", "recording", "zoo", "benchmark", "cli"}),
 }
 

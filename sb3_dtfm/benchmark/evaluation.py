@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_dtfm.benchmark import provenance
 from sb3_dtfm.benchmark.rows import Row, write_row
-from sb3_dtfm.recording.episodes import reported_success
+from sb3_dtfm.envs.success import reported_success
 
 # First seeds of the two sets of initial states: apart from each other, and from those of recordings, which count from 0.
 TRAINING_STATES = 1_000_000

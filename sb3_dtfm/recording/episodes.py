@@ -10,6 +10,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_dtfm.envs.success import reported_success
+
 # (batched observations, episode starts (n_envs,), episode numbers (n_envs,)) -> actions (n_envs, A)
 ActFunction = Callable[[Any, np.ndarray, Sequence[int]], np.ndarray]
 
@@ -76,12 +78,6 @@ class EpisodeRecorder(gym.Wrapper):
         episode.terminated, episode.truncated = bool(terminated), bool(truncated)
         episode.success = reported_success(info)
         return observation, reward, terminated, truncated, info
-
-
-def reported_success(info: dict[str, Any]) -> bool | None:
-    """What a step's `info` says: by SB3's name of it, or that of gymnasium-robotics' mazes and hands; None for nothing."""
-    success = info.get("is_success", info.get("success"))
-    return None if success is None else bool(success)
 
 
 def run_episodes(envs: Sequence[gym.Env], act: ActFunction, seeds: Sequence[int]) -> Iterator[RecordedEpisode]:

@@ -92,6 +92,7 @@ def _sample_trunk(trial: optuna.Trial) -> dict[str, Any]:
         "dropout": trial.suggest_float("dropout", 0.0, 0.3),
         "timestep_embedding": trial.suggest_categorical("timestep_embedding", [True, False]),
         "tokens_per_step": trial.suggest_categorical("tokens_per_step", [1, 3]),
+        "chunk_size": trial.suggest_categorical("chunk_size", [1, 4, 8, 16]),
         "clip_return_to_go": trial.suggest_categorical("clip_return_to_go", [True, False]),
         "average_return_to_go": trial.suggest_categorical("average_return_to_go", [True, False]),
         "film_return_to_go": trial.suggest_categorical("film_return_to_go", [True, False]),
