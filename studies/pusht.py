@@ -2,7 +2,7 @@
 Push-T of gym-pusht (`pip install gym-pusht`) from its state, and the demonstrations of Diffusion Policy (Chi et al., 2023).
 
     PYTHONPATH=studies python -m pusht pusht_cchi_v7_lowdim.npz pusht.npz
-    PYTHONPATH=studies python -m pusht pusht_cchi_v7_lowdim.npz     # how well people did
+    PYTHONPATH=studies python -m pusht pusht_cchi_v7_lowdim.npz     # how well people did; that mirroring changes nothing
     PYTHONPATH=studies sb3-dtfm benchmark --gym-packages pusht --env PushT-v0 --profile studies/pusht.yml ...
 
 The block's angle is told by its sine and cosine, since it jumps from 2 pi to 0. A step's reward is by how much the overlap
@@ -101,9 +101,13 @@ def main(source: str, target: str | None = None) -> None:
     with np.load(source) as recorded:
         states, actions, ends = recorded["state"], recorded["action"], recorded["episode_ends"]
     if target is None:
-        episodes = zip(np.split(states, ends[:-1]), np.split(actions, ends[:-1]), strict=True)
-        largest = np.array([simulated_overlaps(*episode).max() for episode in tqdm(episodes, total=len(ends))])
+        episodes = list(zip(np.split(states, ends[:-1]), np.split(actions, ends[:-1]), strict=True))
+        overlaps = [simulated_overlaps(*episode) for episode in tqdm(episodes)]
+        images = [simulated_overlaps(*map(mirrored, episode)) for episode in tqdm(episodes, desc="mirrored")]
+        largest = np.array([each.max() for each in overlaps])
         print(f"largest overlap {largest.mean():.3f}, solved {np.sum(largest >= 1.0)} of {len(largest)}")
+        difference = np.abs(np.concatenate(images) - np.concatenate(overlaps)).max()
+        print(f"largest difference of an overlap when mirrored {difference:.2g}")
         return
     np.savez(
         target,

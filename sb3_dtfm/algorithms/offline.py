@@ -102,8 +102,8 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         parallel = DataParallel(self.policy, self._loss_function(), self.batch_size)
         batch_generator, noise_generator = self._training_generators(parallel)
         n_ahead = self.policy.chunk_size - 1
-        drawn = (self.batch_size, self.context_length, batch_generator, self.timestep_exponent, n_ahead, self.return_weight)
-        batches = buffer.batches(*drawn)
+        sizes = (self.batch_size, self.context_length, batch_generator)
+        batches = buffer.batches(*sizes, self.timestep_exponent, n_ahead, self.return_weight)
         callback.on_training_start(locals(), globals())
         parallel.from_first(True)  # which may evaluate for longer than a gradient step's messages wait
         while self.num_timesteps < total_timesteps:

@@ -72,10 +72,9 @@ def main(argv: Sequence[str]) -> None:
     print("\n".join(table(curves)))
     picture = draw(curves, returns, Path(options.output), options.env)
     numbers = picture.with_suffix(".json")
-    origin = {"task": options.env, "dataset": options.dataset, "first_state": first_state(options), "acting": acting}
-    origin["commit"] = commit()
+    origin = {"task": options.env, "dataset": options.dataset, "acting": acting, "first_state": first_state(options)}
     asked = {name: [each._asdict() for each in reached] for name, reached in curves.items()}
-    numbers.write_text(json.dumps({**origin, "versions": versions(), "models": asked}, indent=1) + "\n")
+    numbers.write_text(json.dumps({**origin, "commit": commit(), "versions": versions(), "models": asked}, indent=1) + "\n")
     print(f"\nPicture: {picture}\nReturns of all episodes: {numbers}")
 
 
