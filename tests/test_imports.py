@@ -13,10 +13,11 @@ ROOMS = {
     "networks": ("sb3_dtfm/networks", {"networks"}),
     "windows": ("sb3_dtfm/windows.py", set()),
     "arguments": ("sb3_dtfm/arguments.py", set()),
+    "files": ("sb3_dtfm/files", {"files"}),
     "heads": ("sb3_dtfm/heads", {"heads", "networks", "arguments"}),
     "envs": ("envs", {"envs"}),
     "data": ("sb3_dtfm/data", {"data", "envs", "windows"}),
-    "recording": ("sb3_dtfm/recording", {"recording", "algorithms", "envs", "data"}),
+    "recording": ("sb3_dtfm/recording", {"recording", "algorithms", "envs", "data", "files"}),
     "policies": ("sb3_dtfm/policies", {"networks", "heads", "windows", "arguments", "policies"}),
     "callbacks": ("sb3_dtfm/callbacks.py", {"data"}),
     "optimization": ("sb3_dtfm/optimization.py", set()),
@@ -34,11 +35,12 @@ ROOMS = {
             "callbacks",
             "optimization",
             "distributed",
+            "files",
         },
     ),
     "zoo": ("sb3_dtfm/zoo", {"", "algorithms", "policies", "callbacks", "envs", "distributed", "zoo"}),
-    "benchmark": ("sb3_dtfm/benchmark", {"", "algorithms", "data", "envs", "zoo", "benchmark"}),
-    "cli": ("sb3_dtfm/cli", {"", "algorithms", "data", "envs", "recording", "zoo", "benchmark", "cli"}),
+    "benchmark": ("sb3_dtfm/benchmark", {"", "algorithms", "data", "envs", "zoo", "benchmark", "files"}),
+    "cli": ("sb3_dtfm/cli", {"", "algorithms", "data", "envs", "recording", "zoo", "benchmark", "files", "cli"}),
 }
 
 

@@ -12,9 +12,20 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule, TensorDict
+from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_dtfm.algorithms.saving import (
+    OPTIMIZER,
+    POLICY,
+    UnsavedSchedule,
+    check_policy,
+    from_configuration,
+    optimizer_state,
+    optimizer_tensors,
+    to_configuration,
+)
 from sb3_dtfm.arguments import (
     BOOLEAN,
     COUNT,
@@ -29,6 +40,7 @@ from sb3_dtfm.arguments import (
 from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer, check_action_space, load_dataset
 from sb3_dtfm.distributed import check_batch_size, first_of_each_machine_first, is_first_process
 from sb3_dtfm.envs import check_vec_env, return_to_go_space
+from sb3_dtfm.files import ModelFile, ModelFileError, holds_pickles, read_model, write_model
 from sb3_dtfm.optimization import LEARNING_RATE_SCHEDULES, PRECISIONS, RunningMeans
 from sb3_dtfm.policies import SequencePolicy
 
@@ -170,6 +182,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         """
         :param learning_rate: what a number may be that is given as such: 0 is for those who load a model to act with it
         """
+        if isinstance(self.learning_rate, UnsavedSchedule) and learning_rate is POSITIVE:
+            self.learning_rate.check()
         accepted = ACCEPTED if callable(self.learning_rate) else {**ACCEPTED, "learning_rate": learning_rate}
         vars(self).update(check_arguments(vars(self), accepted))
         check_batch_size(self.batch_size)
@@ -233,17 +247,21 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
             self.score_reference = ScoreReference(*self.score_reference)
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
-        self.policy = self.policy_class(  # type: ignore[assignment]
-            self.observation_space,
+        self.policy = self._make_policy(ema=self.ema_decay > 0).to(self.device)  # type: ignore[assignment]
+
+    def _make_policy(self, ema: bool) -> SequencePolicy:
+        assert issubclass(self.policy_class, SequencePolicy)
+        return self.policy_class(
+            self.observation_space,  # type: ignore[arg-type]
             self.action_space,
             self.lr_schedule,
             context_length=self.context_length,
             max_timestep=self.max_timestep,
             weight_decay=self.weight_decay,
-            ema=self.ema_decay > 0,
+            ema=ema,
             seed=self.seed,
             **self.policy_kwargs,
-        ).to(self.device)
+        )
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """
@@ -294,25 +312,103 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
         force_reset: bool = True,
+        allow_pickle: bool = False,
         **kwargs: Any,
     ) -> SelfAlgorithm:
         """
-        SB3's loading; arguments are SB3's.
+        SB3's loading, which runs nothing that a file holds; arguments are SB3's but for `allow_pickle`.
 
         :param path: file to load
         :param env: see :meth:`set_env`
         :param device: "auto", "cpu" or "cuda"
-        :param custom_objects: objects to use in place of those in the file
+        :param custom_objects: attributes to use in place of those in the file
         :param print_system_info: print what the file was saved with
         :param force_reset: as in SB3
+        :param allow_pickle: load files as SB3 saves them, and this package did before 0.2. That runs whatever their author
+            wanted to be run: for files that you trust
         :param kwargs: attributes to change, `dataset` for example
+        :raises ModelFileError: the file is damaged, pickled, of another algorithm, or holds what no model can have
         :raises ValueError: an attribute out of range, or an environment that does not fit
         """
-        model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
+        if allow_pickle and holds_pickles(path):
+            model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
+        else:
+            model = cls._from_file(path, device, custom_objects or {}, print_system_info, kwargs)
         model.policy.set_weight_decay(model.weight_decay)  # the optimiser's state in the file brings that of its own
         if env is not None:
             model.set_env(env, force_reset)
         return model
+
+    @classmethod
+    def _from_file(
+        cls: type[SelfAlgorithm],
+        path: str | Path | io.BufferedIOBase,
+        device: th.device | str,
+        custom_objects: dict[str, Any],
+        print_system_info: bool,
+        changed: dict[str, Any],
+    ) -> SelfAlgorithm:
+        """A model of what the file says, and of attributes that are changed."""
+        source = str(getattr(path, "name", path))
+        configuration, tensors = read_model(path, {POLICY, OPTIMIZER}, get_device(device), print_system_info)
+        attributes = from_configuration(cls, configuration, custom_objects, source)
+        if changed.get("policy_kwargs", attributes.get("policy_kwargs")) != attributes.get("policy_kwargs"):
+            raise ValueError(
+                f"policy_kwargs are what the weights of {source} were made with, {attributes.get('policy_kwargs')}, and "
+                f"cannot be changed: got {changed['policy_kwargs']}."
+            )
+        model = cls(attributes["policy_class"], device=device, _init_setup_model=False)
+        try:
+            vars(model).update(attributes)
+            model._check_sizes(tensors[POLICY], source)
+        except ModelFileError:
+            raise
+        except (TypeError, ValueError, AttributeError) as error:
+            raise ModelFileError(f"{source}: {error}") from error
+        vars(model).update(changed)
+        model._setup_model()
+        model.set_parameters(model._parameters(tensors, source), device=device)
+        return model
+
+    def _check_sizes(self, tensors: dict[str, th.Tensor], source: str) -> None:
+        """
+        See :func:`~sb3_dtfm.algorithms.saving.check_policy`.
+
+        :raises ModelFileError: more layers than there are tensors, or others than these settings make
+        """
+        self._check_arguments(learning_rate=NOT_NEGATIVE)
+        for name, value in (self.policy_kwargs or {}).items():
+            if name.endswith("n_layers") and isinstance(value, int) and value > len(tensors):
+                raise ModelFileError(f"{source}: policy_kwargs say {name}={value}, and there are {len(tensors)} tensors.")
+        self._setup_lr_schedule()
+        with th.device("meta"):
+            check_policy(self._make_policy(ema=False), tensors, source)
+
+    def _parameters(self, tensors: dict[str, dict[str, th.Tensor]], source: str) -> dict[str, dict[str, Any]]:
+        """What :meth:`set_parameters` takes, from the tensors of a file."""
+        optimizer = optimizer_state(self.policy.optimizer, tensors[OPTIMIZER], source)
+        return {POLICY: tensors[POLICY], OPTIMIZER: optimizer}
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | TensorDict,
+        exact_match: bool = True,
+        device: th.device | str = "auto",
+    ) -> None:
+        """
+        SB3's, from a file as :meth:`save` makes them.
+
+        :param load_path_or_dict: the file, or what `get_parameters` gives
+        :param exact_match: all parameters have to be there, and no others
+        :param device: where they are loaded to
+        :raises ModelFileError: the file is damaged, pickled, or of another model
+        """
+        if not isinstance(load_path_or_dict, dict):
+            source = str(getattr(load_path_or_dict, "name", load_path_or_dict))
+            _, tensors = read_model(load_path_or_dict, {POLICY, OPTIMIZER}, get_device(device))
+            self._check_sizes(tensors[POLICY], source)
+            load_path_or_dict = self._parameters(tensors, source)
+        super().set_parameters(load_path_or_dict, exact_match, device)
 
     def save(
         self,
@@ -321,17 +417,28 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         include: Iterable[str] | None = None,
     ) -> None:
         """
-        SB3's saving, on process 0 only: the others hold the same model, and would write the same file at the same time.
+        SB3's saving, into a file of JSON and safetensors that appears when it is complete.
+
+        On process 0 only: the others hold the same model, and would write the same file at the same time.
 
         :param path: file to write
         :param exclude: attributes to leave out beside the default ones
         :param include: attributes to save although they are left out by default
+        :raises OSError: names the path, where what was there before still is
+        :raises ValueError: an attribute of `include` that is no plain value
         """
-        if is_first_process():
-            super().save(path, exclude, include)
+        if not is_first_process():
+            return
+        wanted = set(include or ())
+        left_out = {*self._excluded_save_params(), *(exclude or ())} - wanted
+        parameters = self.get_parameters()
+        tensors = {POLICY: parameters[POLICY], OPTIMIZER: optimizer_tensors(self.policy.optimizer)}
+        write_model(path, ModelFile(to_configuration(self, left_out, wanted), tensors))
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "dataset", "buffer", "_means"]
+        of_an_environment = ["_last_obs", "_last_episode_starts", "_last_original_obs", "ep_info_buffer", "ep_success_buffer"]
+        made_anew = ["lr_schedule", "action_noise", "dataset", "buffer", "_means"]
+        return [*super()._excluded_save_params(), *of_an_environment, *made_anew]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", "policy.optimizer"], []
+        return [POLICY, OPTIMIZER], []

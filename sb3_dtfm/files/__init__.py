@@ -1,0 +1,6 @@
+"""Files: how one is replaced, and what a saved model is made of."""
+
+from sb3_dtfm.files.model import ModelFile, ModelFileError, holds_pickles, read_model, write_model
+from sb3_dtfm.files.replacing import replacing
+
+__all__ = ["ModelFile", "ModelFileError", "holds_pickles", "read_model", "replacing", "write_model"]

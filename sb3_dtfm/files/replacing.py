@@ -1,0 +1,78 @@
+"""A file appears under its name when it is complete: whoever is killed meanwhile leaves the one that was there before."""
+
+import contextlib
+import os
+import re
+import secrets
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+# A hidden file that becomes the one asked for tells who writes it: the machine and the process, and a random word.
+MACHINE = re.sub(r"\W", "-", socket.gethostname())
+LEFTOVER = re.compile(r"\..+\.(?P<machine>[\w-]+)\.(?P<process>\d+)\.[0-9a-f]+\.part")
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """
+    A path to write to, which takes the place of `path` at the end if nothing was raised.
+
+    What killed processes left behind in the folder is removed first.
+
+    :param path: the file, there already or not; its folder is made if necessary
+    :return: an empty file beside it
+    :raises OSError: names `path` if it cannot be written; what was there before is still there
+    """
+    target = Path(path)
+    beside = target.with_name(f".{target.name}.{MACHINE}.{os.getpid()}.{secrets.token_hex(4)}.part")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(target.parent)
+        beside.touch(exist_ok=False)
+        try:
+            yield beside
+            _sync(beside)
+            beside.replace(target)
+        finally:
+            beside.unlink(missing_ok=True)
+        _sync(target.parent)
+    except OSError as error:  # whatever was in the way, the hidden file or the folder: this is the name that the caller knows
+        if error.errno is None:  # a library's own message
+            raise OSError(f"{target}: {error}") from error
+        raise OSError(error.errno, error.strerror, str(target)) from error
+
+
+def remove_leftovers(folder: Path) -> None:
+    """
+    Remove what processes of this machine were writing when they were killed.
+
+    :param folder: where files are replaced
+    """
+    for path in folder.glob(".*.part"):
+        named = LEFTOVER.fullmatch(path.name)
+        if named and named["machine"] == MACHINE and not _may_be_alive(int(named["process"])):
+            path.unlink(missing_ok=True)
+
+
+def _may_be_alive(process: int) -> bool:
+    if os.name != "posix":
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # another user's
+        return True
+    return True
+
+
+def _sync(path: Path) -> None:
+    """Have a file, or the names in a folder, survive a loss of power."""
+    if path.is_dir() and os.name != "posix":
+        return
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
