@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from datetime import timedelta
 from typing import Any, TypeAlias
 
-import numpy as np
 import torch as th
 import torch.distributed as dist
 from torch import nn
@@ -151,18 +150,6 @@ class DataParallel:
         message = th.frombuffer(bytearray(int(number).to_bytes(8, "little")), dtype=th.uint8)
         dist.broadcast(message, src=0, group=self._messages)
         return int.from_bytes(message.numpy().tobytes(), "little")
-
-    def seed(self, seed: int) -> int:
-        """
-        Let the processes draw the same batches and different dropout.
-
-        :param seed: of this process
-        :return: process 0's, for what all of them draw alike
-        """
-        seed = self.from_first(seed)
-        if self.n_processes > 1:
-            th.manual_seed(int(np.random.SeedSequence([seed, self.rank]).generate_state(1, np.uint64)[0]))
-        return seed
 
     def close(self) -> None:
         """Give the connections back, at the same point on every process."""

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import torch as th
 
 LEARNING_RATE_SCHEDULES = ("constant", "linear", "cosine")
@@ -44,11 +45,15 @@ def autocast(precision: str, device: th.device) -> th.autocast:
 
 
 class RunningMeans:
-    """Means of scalars, summed on their device: reading each value would wait for it."""
+    """
+    Means of scalars, summed on their device: reading each value would wait for it.
 
-    def __init__(self) -> None:
-        self._sums: dict[str, th.Tensor] = {}
-        self.n_values = 0
+    :param sums: of :meth:`sums` and `n_values`, to go on from
+    """
+
+    def __init__(self, sums: dict[str, float] | None = None, n_values: int = 0) -> None:
+        self._sums = {name: th.tensor(total) for name, total in (sums or {}).items()}
+        self.n_values = n_values
 
     def add(self, values: dict[str, th.Tensor]) -> None:
         """
@@ -58,11 +63,45 @@ class RunningMeans:
         """
         for name, value in values.items():
             total = self._sums.get(name)
-            self._sums[name] = value.detach().clone() if total is None else total.add_(value.detach())
+            self._sums[name] = value.detach().clone() if total is None else total.to(value.device).add_(value.detach())
         self.n_values += 1
+
+    def sums(self) -> dict[str, float]:
+        """The sums of what was added, as they are."""
+        return {name: float(total) for name, total in self._sums.items()}
 
     def pop(self) -> dict[str, float]:
         """The means since the last call, and a fresh start."""
-        means = {name: float(total) / self.n_values for name, total in self._sums.items()}
+        means = {name: total / self.n_values for name, total in self.sums().items()}
         self._sums, self.n_values = {}, 0
         return means
+
+
+# What each number of a run's random stream is for.
+BATCHES, NOISE, DROPOUT = range(3)
+
+
+def step_seed(seed: int, n_updates: int, *purpose: int) -> int:
+    """
+    What a generator is seeded with for one gradient step.
+
+    Each step has a seed of its own, so that a run that was interrupted goes on as if it had not been.
+
+    :param seed: of the run
+    :param n_updates: gradient steps that the model has had
+    :param purpose: one of `BATCHES`, `NOISE` and `DROPOUT`, and the process where each draws its own
+    """
+    return int(np.random.SeedSequence([seed, n_updates, *purpose]).generate_state(1, np.uint64)[0])
+
+
+def seed_default_generator(device: th.device, seed: int) -> None:
+    """
+    Seed what dropout draws from; `torch.manual_seed` takes a thousand times as long.
+
+    :param device: of the network
+    :param seed: any
+    """
+    if device.type == "cuda":
+        th.cuda.manual_seed(seed)
+    else:
+        th.default_generator.manual_seed(seed)

@@ -166,7 +166,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         self.score_reference: ScoreReference | None = None
         self.buffer: TrajectoryBuffer | None = None
         self._means = RunningMeans()
-        self._training_seconds = 0.0
+        self._training_seconds, self._timed_steps = 0.0, 0
+        self._training_seed: int | None = None  # where `seed` is None
         if _init_setup_model:
             self._check_arguments(learning_rate=POSITIVE)
             buffer = self._load_buffer()
@@ -437,7 +438,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
 
     def _excluded_save_params(self) -> list[str]:
         of_an_environment = ["_last_obs", "_last_episode_starts", "_last_original_obs", "ep_info_buffer", "ep_success_buffer"]
-        made_anew = ["lr_schedule", "action_noise", "dataset", "buffer", "_means"]
+        made_anew = ["lr_schedule", "action_noise", "dataset", "buffer", "_training_seconds", "_timed_steps"]
         return [*super()._excluded_save_params(), *of_an_environment, *made_anew]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -1,10 +1,10 @@
 """The offline learn loop."""
 
+import itertools
 import math
 import time
 from typing import Any, TypeVar
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
@@ -14,7 +14,16 @@ from sb3_dtfm.algorithms.base import OfflineAlgorithm
 from sb3_dtfm.arguments import POSITIVE
 from sb3_dtfm.callbacks import GradientStepProgressBar, NormalizedScoreCallback, find_eval_callbacks
 from sb3_dtfm.distributed import DataParallel, LossFunction, is_first_process
-from sb3_dtfm.optimization import RunningMeans, autocast, learning_rate_factor
+from sb3_dtfm.optimization import (
+    BATCHES,
+    DROPOUT,
+    NOISE,
+    RunningMeans,
+    autocast,
+    learning_rate_factor,
+    seed_default_generator,
+    step_seed,
+)
 from sb3_dtfm.windows import Windows
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineSequenceAlgorithm")
@@ -65,7 +74,9 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
             total_timesteps += self.num_timesteps
         self._total_timesteps = total_timesteps
         self._num_timesteps_at_start = self.num_timesteps
-        self._means, self._training_seconds = RunningMeans(), 0.0
+        self._training_seconds, self._timed_steps = 0.0, 0
+        if reset_num_timesteps:
+            self._means = RunningMeans()
         if not self._custom_logger:
             verbose, folder = (self.verbose, self.tensorboard_log) if is_first_process() else (0, None)
             self._logger = configure_logger(verbose, folder, tb_log_name, reset_num_timesteps)
@@ -100,24 +111,35 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         parallel = DataParallel(self.policy, self._loss_function(), self.batch_size)
-        batch_generator, noise_generator = self._training_generators(parallel)
-        n_ahead = self.policy.chunk_size - 1
-        sizes = (self.batch_size, self.context_length, batch_generator)
-        batches = buffer.batches(*sizes, self.timestep_exponent, n_ahead, self.return_weight)
+        seed = self._training_seed = parallel.from_first(self._choose_training_seed())
+        generator = th.Generator(self.device)
+        batch_seeds = (step_seed(seed, n_updates, BATCHES) for n_updates in itertools.count(self._n_updates))
+        batches = buffer.batches(
+            self.batch_size,
+            self.context_length,
+            th.Generator(self.device),
+            self.timestep_exponent,
+            n_ahead=self.policy.chunk_size - 1,
+            return_weight=self.return_weight,
+            seeds=batch_seeds,
+        )
         callback.on_training_start(locals(), globals())
         parallel.from_first(True)  # which may evaluate for longer than a gradient step's messages wait
         while self.num_timesteps < total_timesteps:
             step_start = time.perf_counter()
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
-            self._gradient_step(next(batches), noise_generator, parallel)
+            generator.manual_seed(step_seed(seed, self._n_updates, NOISE))
+            seed_default_generator(self.device, step_seed(seed, self._n_updates, DROPOUT, parallel.rank))
+            self._gradient_step(next(batches), generator, parallel)
             self.num_timesteps += 1
             self._training_seconds += time.perf_counter() - step_start
+            self._timed_steps += 1
             if log_interval and (self.num_timesteps % log_interval == 0 or self.num_timesteps == total_timesteps):
                 self.dump_logs()
             callback.update_locals(locals())
             if not parallel.from_first(callback.on_step()):
                 break
-        self._check_finite(self._pop_means())
+        self._check_finite(self._means.sums())
         callback.on_training_end()
         parallel.close()
         return self
@@ -156,12 +178,11 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         for optimizer in optimizers if isinstance(optimizers, list) else [optimizers]:
             update_learning_rate(optimizer, self._current_learning_rate)
 
-    def _training_generators(self, parallel: DataParallel) -> tuple[th.Generator, th.Generator]:
-        """Randomness of batches and of losses: the run's own, and other streams where training is continued."""
-        seed = parallel.seed(th.Generator().seed() if self.seed is None else self.seed)
-        states = np.random.SeedSequence([seed, self._n_updates]).generate_state(2, np.uint64)
-        batches, noise = (th.Generator(self.device).manual_seed(int(state)) for state in states)
-        return batches, noise
+    def _choose_training_seed(self) -> int:
+        """The run's seed; one that was drawn stays the model's."""
+        if self.seed is not None:
+            return self.seed
+        return th.Generator().seed() if self._training_seed is None else self._training_seed
 
     def dump_logs(self) -> None:
         """
@@ -169,14 +190,13 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
 
         :raises FloatingPointError: the loss or its gradient is no longer finite
         """
-        n_steps = self._means.n_values
-        if n_steps == 0:
+        if self._means.n_values == 0:
             return
         means = self._pop_means()
         self._check_finite(means)
         if is_first_process():
-            self._log(means, n_steps)
-        self._training_seconds = 0.0
+            self._log(means)
+        self._training_seconds, self._timed_steps = 0.0, 0
 
     def _pop_means(self) -> dict[str, float]:
         """The means since the last call; where a GPU computes them, the time to wait for them is training time."""
@@ -196,13 +216,13 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
                     "steps change no weight. Try a lower learning_rate, warmup_steps or max_grad_norm."
                 )
 
-    def _log(self, means: dict[str, float], n_steps: int) -> None:
+    def _log(self, means: dict[str, float]) -> None:
         for name, mean in means.items():
             self.logger.record(f"train/{name}", mean)
         self.logger.record("train/action_mse", self._training_action_mse())
         self.logger.record("train/learning_rate", self._current_learning_rate)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("time/steps_per_second", n_steps / self._training_seconds)
+        self.logger.record("time/steps_per_second", self._timed_steps / self._training_seconds)
         self.logger.record("time/time_elapsed", int((time.time_ns() - self.start_time) / 1e9), exclude="tensorboard")
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(step=self.num_timesteps)

@@ -1,6 +1,7 @@
 """What of a model is saved, as JSON and tensors; and the checks that it passes on its way back."""
 
 import json
+import math
 import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -15,12 +16,13 @@ from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, Line
 from sb3_dtfm.arguments import COUNT, Number, Rule, check_arguments
 from sb3_dtfm.envs import OBSERVATION, RETURN_TO_GO, TIMESTEP
 from sb3_dtfm.files import ModelFileError
+from sb3_dtfm.optimization import RunningMeans
 from sb3_dtfm.policies import SequencePolicy
 
 POLICY, OPTIMIZER = "policy", "policy.optimizer"
 SPACES = ("observation_space", "action_space")
 # Attributes that have a form of their own in the file.
-ENCODED = (*SPACES, "policy_class", "learning_rate")
+ENCODED = (*SPACES, "policy_class", "learning_rate", "_means")
 WHOLE = Number(low=0, whole=True)
 # What the file says of a model beside its arguments, which are checked as when they are given.
 COUNTERS: dict[str, Rule] = {
@@ -82,6 +84,7 @@ def to_configuration(model: BaseAlgorithm, left_out: Iterable[str], wanted: Iter
         "algorithm": _head_name(type(model)),
         "policy_class": _policy_name(model),
         "learning_rate": _learning_rate(model.learning_rate),
+        "means": _means(model._means),  # type: ignore[attr-defined]
         **{name: serialize_space(getattr(model, name)) for name in SPACES},
         "attributes": saved,
     }
@@ -117,6 +120,13 @@ def _learning_rate(learning_rate: Any) -> Any:
     return getattr(schedule, "__name__", repr(schedule)) if callable(schedule) else float(schedule)
 
 
+def _means(means: RunningMeans) -> dict[str, Any]:
+    sums = means.sums()
+    if not all(map(math.isfinite, sums.values())):  # what is to be logged next is an error
+        return {"n_values": 0, "sums": {}}
+    return {"n_values": means.n_values, "sums": sums}
+
+
 def from_configuration(
     algorithm: type[BaseAlgorithm], configuration: Mapping[str, Any], custom_objects: Mapping[str, Any], source: str
 ) -> dict[str, Any]:
@@ -143,6 +153,7 @@ def from_configuration(
         if hasattr(algorithm, name) or name in (*ENCODED, "policy", "device", "env"):
             raise ModelFileError(f"{source}: {name} is no attribute that a model is saved with.")
     attributes.update({name: _space(taken(name, str), f"{source}: {name}") for name in SPACES})
+    attributes["_means"] = _to_means(taken("means", dict), source)
     attributes.update(custom_objects)
     if "learning_rate" not in custom_objects:
         attributes["learning_rate"] = _to_learning_rate(taken("learning_rate", (int, float, str, dict)), source)
@@ -156,15 +167,10 @@ def from_configuration(
         attributes["policy_class"] = algorithm.policy_aliases[name]
     _check_spaces(attributes, source)
     try:
-        check_arguments({**_defaults(), **attributes}, COUNTERS)
+        check_arguments({**dict.fromkeys(COUNTERS, 1), **attributes}, COUNTERS)  # one may have been left out
     except ValueError as error:
         raise ModelFileError(f"{source}: {error}") from error
     return attributes
-
-
-def _defaults() -> dict[str, int]:
-    """Of counters that were left out when the model was saved."""
-    return {name: 1 for name in COUNTERS}
 
 
 def _space(described: str, what: str) -> spaces.Space:
@@ -194,6 +200,14 @@ def _to_learning_rate(saved: Any, source: str) -> Any:
         return LinearSchedule(**{name: float(value) for name, value in saved.items()})
     except (TypeError, ValueError) as error:
         raise ModelFileError(f"{source}: learning_rate is {saved}, expected start, end and end_fraction.") from error
+
+
+def _to_means(saved: dict[str, Any], source: str) -> RunningMeans:
+    n_values, sums = saved.get("n_values"), saved.get("sums")
+    numbers = sums.values() if isinstance(sums, dict) else [None]
+    if not WHOLE.accepts(n_values) or not all(map(Number().accepts, numbers)) or bool(n_values) != bool(sums):
+        raise ModelFileError(f"{source}: means are {saved}, expected sums of a number of values.")
+    return RunningMeans(sums, n_values)
 
 
 def optimizer_tensors(optimizer: th.optim.Optimizer) -> dict[str, th.Tensor]:

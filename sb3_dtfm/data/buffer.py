@@ -265,6 +265,7 @@ class TrajectoryBuffer:
         timestep_exponent: float = 1.0,
         n_ahead: int = 0,
         return_weight: float = 0.0,
+        seeds: Iterable[int] | None = None,
     ) -> Iterator[Windows]:
         """
         Endless batches of windows, each drawn before the one before it is handed out.
@@ -279,11 +280,15 @@ class TrajectoryBuffer:
         :param n_ahead: see :meth:`windows`
         :param return_weight: w: a step of an episode of return R is drawn 1 + w (R - Rmin) / (Rmax - Rmin) times as often as
             one of the worst episode (Yue et al., 2022)
+        :param seeds: what `generator` is seeded with before it draws, one number a batch: where each is its own, a run that
+            goes on draws what it would have drawn. Without them the generator draws on
         """
         weights = self._episode_weights(return_weight).to(generator.device) if return_weight > 0 else None
 
         def ends() -> Iterator[th.Tensor]:
-            while True:
+            for seed in itertools.repeat(None) if seeds is None else seeds:
+                if seed is not None:
+                    generator.manual_seed(seed)
                 drawn = self._draw(batch_size, generator, timestep_exponent, weights)
                 self._prefetch(drawn, context_length, n_ahead)
                 yield drawn

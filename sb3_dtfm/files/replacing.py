@@ -24,7 +24,10 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     :return: an empty file beside it
     :raises OSError: names `path` if it cannot be written; what was there before is still there
     """
-    target = Path(path)
+    target = Path(os.path.realpath(path))  # of a link, what it leads to
+    if target.exists() and not target.is_file() and not target.is_dir():  # a device or a pipe
+        yield target
+        return
     beside = target.with_name(f".{target.name}.{MACHINE}.{os.getpid()}.{secrets.token_hex(4)}.part")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -39,8 +42,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         _sync(target.parent)
     except OSError as error:  # whatever was in the way, the hidden file or the folder: this is the name that the caller knows
         if error.errno is None:  # a library's own message
-            raise OSError(f"{target}: {error}") from error
-        raise OSError(error.errno, error.strerror, str(target)) from error
+            raise OSError(f"{path}: {error}") from error
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def remove_leftovers(folder: Path) -> None:
