@@ -24,6 +24,32 @@ class GradientStepProgressBar(ProgressBarCallback):
         return True
 
 
+class SeedEvaluations(BaseCallback):
+    """
+    Start each evaluation's environments from a seed of its own, whatever was evaluated before: a run that is resumed then
+    evaluates as it would have. Put it before the callbacks that evaluate.
+
+    :param eval_callbacks: the evaluations
+    :param seed: of the run
+    """
+
+    def __init__(self, eval_callbacks: list[EvalCallback], seed: int) -> None:
+        super().__init__()
+        self.eval_callbacks = [evaluation for evaluation in eval_callbacks if evaluation.eval_freq > 0]
+        self.seed = seed
+
+    def _on_step(self) -> bool:
+        self._seed([each for each in self.eval_callbacks if (each.n_calls + 1) % each.eval_freq == 0])
+        return True
+
+    def _on_training_end(self) -> None:
+        self._seed(self.eval_callbacks)
+
+    def _seed(self, eval_callbacks: list[EvalCallback]) -> None:
+        for evaluation in eval_callbacks:
+            evaluation.eval_env.seed((self.seed + self.num_timesteps) % 2**31)  # counts as of the next reset
+
+
 class EvaluateAtStartAndEnd(BaseCallback):
     """
     Evaluate before the first gradient step and after the last one too, where `EvalCallback` counts full intervals only.
@@ -38,6 +64,14 @@ class EvaluateAtStartAndEnd(BaseCallback):
         super().__init__()
         self.eval_callbacks = [evaluation for evaluation in eval_callbacks if evaluation.eval_freq > 0]
         self._evaluated_at: int | None = None
+
+    def go_on(self, num_timesteps: int) -> None:
+        """
+        Do not evaluate before the next gradient step: the run is resumed in its midst.
+
+        :param num_timesteps: gradient steps so far
+        """
+        self._evaluated_at = num_timesteps
 
     def _on_training_start(self) -> None:
         if self._evaluated_at != self.num_timesteps:

@@ -38,7 +38,7 @@ ROOMS = {
             "files",
         },
     ),
-    "zoo": ("sb3_dtfm/zoo", {"", "algorithms", "policies", "callbacks", "envs", "distributed", "zoo"}),
+    "zoo": ("sb3_dtfm/zoo", {"", "algorithms", "policies", "callbacks", "envs", "distributed", "files", "zoo"}),
     "benchmark": ("sb3_dtfm/benchmark", {"", "algorithms", "data", "envs", "zoo", "benchmark", "files"}),
     "cli": ("sb3_dtfm/cli", {"", "algorithms", "data", "envs", "recording", "zoo", "benchmark", "files", "cli"}),
 }

@@ -22,6 +22,7 @@ from sb3_dtfm.algorithms.saving import (
     UnsavedSchedule,
     check_policy,
     from_configuration,
+    naming_the_file,
     optimizer_state,
     optimizer_tensors,
     to_configuration,
@@ -40,7 +41,7 @@ from sb3_dtfm.arguments import (
 from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer, check_action_space, load_dataset
 from sb3_dtfm.distributed import check_batch_size, first_of_each_machine_first, is_first_process
 from sb3_dtfm.envs import check_vec_env, return_to_go_space
-from sb3_dtfm.files import ModelFile, ModelFileError, holds_pickles, read_model, write_model
+from sb3_dtfm.files import ModelFile, ModelFileError, file_name, holds_pickles, read_model, write_model
 from sb3_dtfm.optimization import LEARNING_RATE_SCHEDULES, PRECISIONS, RunningMeans
 from sb3_dtfm.policies import SequencePolicy
 
@@ -50,7 +51,7 @@ Dataset: TypeAlias = str | PathLike[str] | minari.MinariDataset | TrajectoryBuff
 ACCEPTED: dict[str, Rule] = {
     "batch_size": COUNT,
     "weight_decay": NOT_NEGATIVE,
-    "context_length": COUNT,
+    "context_length": Number(low=1, high=100_000, whole=True),
     "dataset_fraction": Number(low=0, high=1, above_low=True),
     "dataset_seed": Number(low=0, whole=True),
     "timestep_exponent": POSITIVE,
@@ -350,7 +351,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         changed: dict[str, Any],
     ) -> SelfAlgorithm:
         """A model of what the file says, and of attributes that are changed."""
-        source = str(getattr(path, "name", path))
+        source = file_name(path)
         configuration, tensors = read_model(path, {POLICY, OPTIMIZER}, get_device(device), print_system_info)
         attributes = from_configuration(cls, configuration, custom_objects, source)
         if changed.get("policy_kwargs", attributes.get("policy_kwargs")) != attributes.get("policy_kwargs"):
@@ -359,16 +360,13 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
                 f"cannot be changed: got {changed['policy_kwargs']}."
             )
         model = cls(attributes["policy_class"], device=device, _init_setup_model=False)
-        try:
-            vars(model).update(attributes)
+        vars(model).update(attributes)
+        with naming_the_file(source):
             model._check_sizes(tensors[POLICY], source)
-        except ModelFileError:
-            raise
-        except (TypeError, ValueError, AttributeError) as error:
-            raise ModelFileError(f"{source}: {error}") from error
         vars(model).update(changed)
         model._setup_model()
-        model.set_parameters(model._parameters(tensors, source), device=device)
+        with naming_the_file(source):
+            model.set_parameters(model._parameters(tensors, source), device=device)
         return model
 
     def _check_sizes(self, tensors: dict[str, th.Tensor], source: str) -> None:
@@ -405,7 +403,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         :raises ModelFileError: the file is damaged, pickled, or of another model
         """
         if not isinstance(load_path_or_dict, dict):
-            source = str(getattr(load_path_or_dict, "name", load_path_or_dict))
+            source = file_name(load_path_or_dict)
             _, tensors = read_model(load_path_or_dict, {POLICY, OPTIMIZER}, get_device(device))
             self._check_sizes(tensors[POLICY], source)
             load_path_or_dict = self._parameters(tensors, source)
@@ -437,7 +435,13 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         write_model(path, ModelFile(to_configuration(self, left_out, wanted), tensors))
 
     def _excluded_save_params(self) -> list[str]:
-        of_an_environment = ["_last_obs", "_last_episode_starts", "_last_original_obs", "ep_info_buffer", "ep_success_buffer"]
+        of_an_environment = [
+            "_last_obs",
+            "_last_episode_starts",
+            "_last_original_obs",
+            "ep_info_buffer",
+            "ep_success_buffer",
+        ]
         made_anew = ["lr_schedule", "action_noise", "dataset", "buffer", "_training_seconds", "_timed_steps"]
         return [*super()._excluded_save_params(), *of_an_environment, *made_anew]
 

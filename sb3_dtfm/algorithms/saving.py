@@ -1,9 +1,10 @@
 """What of a model is saved, as JSON and tensors; and the checks that it passes on its way back."""
 
+import contextlib
 import json
 import math
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,21 @@ COUNTERS: dict[str, Rule] = {
 }
 # The optimiser's state of a weight: its own shape, or a number.
 MOMENTS = {"step": False, "exp_avg": True, "exp_avg_sq": True}
+
+
+@contextlib.contextmanager
+def naming_the_file(source: str) -> Iterator[None]:
+    """
+    Have whatever does not fit be a fault of the file.
+
+    :raises ModelFileError: names it
+    """
+    try:
+        yield
+    except ModelFileError:
+        raise
+    except (TypeError, ValueError, AttributeError, RuntimeError) as error:
+        raise ModelFileError(f"{source}: {error}") from error
 
 
 class UnsavedSchedule:
@@ -153,6 +169,8 @@ def from_configuration(
         if hasattr(algorithm, name) or name in (*ENCODED, "policy", "device", "env"):
             raise ModelFileError(f"{source}: {name} is no attribute that a model is saved with.")
     attributes.update({name: _space(taken(name, str), f"{source}: {name}") for name in SPACES})
+    if not isinstance(attributes.get("policy_kwargs", {}), dict):
+        raise ModelFileError(f"{source}: policy_kwargs are {attributes['policy_kwargs']!r}, expected arguments by name.")
     attributes["_means"] = _to_means(taken("means", dict), source)
     attributes.update(custom_objects)
     if "learning_rate" not in custom_objects:

@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 
 from sb3_dtfm.zoo import commands
-from sb3_dtfm.zoo.arguments import train_arguments, train_parser
+from sb3_dtfm.zoo.arguments import resumed_run, train_arguments, train_parser
 from sb3_dtfm.zoo.registration import register
+from sb3_dtfm.zoo.resuming import Start
 from sb3_dtfm.zoo.torchrun import joined_processes
 
 
@@ -18,5 +19,7 @@ def main(argv: Sequence[str]) -> None:
     if {"-h", "--help"} & set(argv):
         train_parser().print_help()
         commands.train(["--help"])
-    with joined_processes(train_arguments(argv)) as arguments:
-        commands.train(arguments)
+    resumed, others = resumed_run(argv)
+    arguments = Start.read(resumed).arguments if resumed is not None and not others else train_arguments(others)
+    with joined_processes(arguments) as arguments:
+        commands.train(arguments, resumed)

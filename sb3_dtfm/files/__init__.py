@@ -1,6 +1,23 @@
 """Files: how one is replaced, and what a saved model is made of."""
 
-from sb3_dtfm.files.model import ModelFile, ModelFileError, holds_pickles, read_model, write_model
+from sb3_dtfm.files.model import (
+    ModelFile,
+    ModelFileError,
+    file_name,
+    holds_pickles,
+    read_configuration,
+    read_model,
+    write_model,
+)
 from sb3_dtfm.files.replacing import replacing
 
-__all__ = ["ModelFile", "ModelFileError", "holds_pickles", "read_model", "replacing", "write_model"]
+__all__ = [
+    "ModelFile",
+    "ModelFileError",
+    "file_name",
+    "holds_pickles",
+    "read_configuration",
+    "read_model",
+    "replacing",
+    "write_model",
+]

@@ -91,21 +91,44 @@ def read_model(path: Any, groups: Set[str], device: th.device, print_system_info
     :raises FileNotFoundError: no such file
     :raises ModelFileError: no model, a damaged one, one with other members than those that it should have, or a newer one
     """
-    with _opened(path) as (file, name):
-        try:
-            with zipfile.ZipFile(file) as archive:
-                return _Reader(archive, name).read(groups, device, print_system_info)
-        except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:  # encrypted, or a newer zip
-            raise ModelFileError(f"{name}: no model of Stable-Baselines3, or a damaged one: {error}.") from error
+    with _opened(path) as (file, name), _archive(file, name) as archive:
+        return _Reader(archive, name).read(groups, device, print_system_info)
+
+
+def read_configuration(path: Any) -> dict[str, Any]:
+    """
+    What a file says of its model, without the tensors.
+
+    :param path: as for :func:`read_model`
+    :raises FileNotFoundError: no such file
+    :raises ModelFileError: no model of this package, or a damaged one
+    """
+    with _opened(path) as (file, name), _archive(file, name) as archive:
+        return _Reader(archive, name).configuration()
 
 
 def holds_pickles(path: Any) -> bool:
     """Whether this is a model as Stable-Baselines3 itself saves them: loading its `data` runs what they hold."""
-    with _opened(path) as (file, _):
-        with contextlib.suppress(zipfile.BadZipFile), zipfile.ZipFile(file) as archive:
-            names = archive.namelist()
-            return CONFIGURATION not in names and "data" in names
-    return False
+    with _opened(path) as (file, name), _archive(file, name) as archive:
+        names = archive.namelist()
+    return CONFIGURATION not in names and "data" in names
+
+
+@contextlib.contextmanager
+def _archive(file: BinaryIO, name: str) -> Iterator[zipfile.ZipFile]:
+    """
+    :raises ModelFileError: no zip file, or a damaged one
+    """
+    try:
+        with zipfile.ZipFile(file) as archive:
+            yield archive
+    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:  # also encrypted, or a newer zip
+        raise ModelFileError(f"{name}: no model of Stable-Baselines3, or a damaged one: {error}.") from error
+
+
+def file_name(path: Any) -> str:
+    """What to call a path, or a file object, in messages."""
+    return str(getattr(path, "name", "the file object")) if hasattr(path, "read") else str(path)
 
 
 @contextlib.contextmanager
@@ -113,7 +136,7 @@ def _opened(path: Any) -> Iterator[tuple[BinaryIO, str]]:
     """The file, at its start, and what to call it."""
     if hasattr(path, "read"):
         path.seek(0)
-        yield path, str(getattr(path, "name", "the file object"))
+        yield path, file_name(path)
         path.seek(0)
         return
     found = Path(path) if Path(path).is_file() else Path(f"{path}.zip")
@@ -140,7 +163,7 @@ class _Reader:
         raise ModelFileError(f"{self.name}: {what}")
 
     def read(self, groups: Set[str], device: th.device, print_system_info: bool) -> ModelFile:
-        configuration = self._configuration()
+        configuration = self.configuration()
         about = self._members(configuration, {f"{group}{TENSORS_SUFFIX}" for group in groups})
         if print_system_info:
             print(f"== SAVED MODEL SYSTEM INFO ==\n{self._content(SYSTEM_INFO, MAX_CONFIGURATION).decode(errors='replace')}")
@@ -149,7 +172,8 @@ class _Reader:
             tensors = {group: {name: each.to(device) for name, each in of.items()} for group, of in tensors.items()}
         return ModelFile(configuration, tensors)
 
-    def _configuration(self) -> dict[str, Any]:
+    def configuration(self) -> dict[str, Any]:
+        """See :func:`read_configuration`."""
         if len(self.infos) != len(self.archive.infolist()):
             self.fail("a member is there twice.")
         pickled = [name for name in self.infos if name.endswith(PICKLED)]
@@ -211,5 +235,3 @@ class _Reader:
             return load_tensors(content)
         except (SafetensorError, KeyError, ValueError) as error:
             self.fail(f"{name}: {error}.")
-
-

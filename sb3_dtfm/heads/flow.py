@@ -9,7 +9,7 @@ from typing import Any
 import torch as th
 from torch import nn
 
-from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, POSITIVE, Choice, Rule, check_arguments
+from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, POSITIVE, Choice, Number, Rule, check_arguments
 from sb3_dtfm.heads.base import ActionHead, masked_mean
 from sb3_dtfm.heads.regression import RegressionHead
 from sb3_dtfm.networks.cpu import Linear
@@ -31,7 +31,7 @@ OPTIONS: dict[str, Rule] = {
     "regression_coef": NOT_NEGATIVE,
     "one_step": BOOLEAN,
 }
-ACTING: dict[str, Rule] = {"solver": Choice((*SOLVERS, ONE_STEP)), "n_solver_steps": COUNT}
+ACTING: dict[str, Rule] = {"solver": Choice((*SOLVERS, ONE_STEP)), "n_solver_steps": Number(low=1, high=10_000, whole=True)}
 
 
 def interpolate(noise: th.Tensor, action: th.Tensor, tau: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

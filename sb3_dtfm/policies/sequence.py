@@ -450,7 +450,11 @@ class SequencePolicy(BasePolicy):
         return th.tensor(list(json.dumps(self.acting_settings()).encode()), dtype=th.uint8)
 
     def set_extra_state(self, state: th.Tensor) -> None:
-        self.set_acting(**json.loads(bytes(state.tolist())))
+        try:
+            settings = json.loads(bytes(state.tolist()))
+            self.set_acting(**settings)
+        except (TypeError, UnicodeDecodeError, json.JSONDecodeError) as error:
+            raise ValueError(f"The ways of acting that were saved are damaged: {error}.") from error
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         spaces_and_schedule = dict(

@@ -20,6 +20,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_dtfm.algorithms import ALGORITHMS
+from sb3_dtfm.files import holds_pickles, read_configuration
 
 NOT_NORMALIZED = "none"
 
@@ -135,14 +136,19 @@ def _check_algorithm(asked: type[BaseAlgorithm], model: Path) -> None:
     """
     Refuse an agent of another algorithm.
 
-    The file does not name its class, but it holds the attributes by name, and the policy's module and docstring. They are
-    nearest to those of the class that saved them, whichever version that was.
+    A file of Stable-Baselines3 does not name its class, but it holds the attributes by name, and the policy's module and
+    docstring. They are nearest to those of the class that saved them, whichever version that was.
     """
+    if not holds_pickles(model):
+        saved_by = str(read_configuration(model).get("algorithm"))
+        if saved_by != asked.__name__:
+            raise ValueError(f"{model} was saved by {saved_by}, not by {asked.__name__} (--algo).")
+        return
     try:
         with zipfile.ZipFile(model) as file:
             data = json.loads(file.read("data"))
         saved = {*data, data["policy_class"]["__module__"], data["policy_class"].get("__doc__")}
-    except (zipfile.BadZipFile, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{model} holds no Stable-Baselines3 agent: {error!r}") from error
 
     def distance(algorithm: type[BaseAlgorithm]) -> int:

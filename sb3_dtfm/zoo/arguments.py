@@ -77,11 +77,28 @@ def train_parser() -> argparse.ArgumentParser:
         help="the packaged settings of the paper if not given, 'small' for those of a 2-core machine; "
         "else a YAML file or a Python package, as in RL-Zoo",
     )
+    offline(
+        "--resume",
+        metavar="RUN",
+        help="go on with an interrupted run, as logs/dtfm/HalfCheetah-v5_1, with the arguments that it was started with",
+    )
     shared = parser.add_argument_group("read on the way to RL-Zoo").add_argument
     shared("--algo", default="ppo", help=argparse.SUPPRESS)
     shared("--env", default="CartPole-v1", help=argparse.SUPPRESS)
     shared("-params", "--hyperparams", nargs="+", action="extend", default=[], help=argparse.SUPPRESS)
     return parser
+
+
+def resumed_run(argv: Sequence[str]) -> tuple[Path | None, list[str]]:
+    """
+    The run that `--resume` names, None without, and the other arguments.
+
+    :param argv: the user's arguments
+    """
+    parser = argparse.ArgumentParser(prog="sb3-dtfm train", add_help=False, allow_abbrev=False)
+    parser.add_argument("--resume", type=Path)
+    options, others = parser.parse_known_args(argv)
+    return options.resume, others
 
 
 def train_arguments(argv: Sequence[str]) -> list[str]:

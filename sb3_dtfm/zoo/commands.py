@@ -1,7 +1,9 @@
 """RL-Zoo's `train` and `enjoy` as functions of their arguments, which they read from `sys.argv`."""
 
+import functools
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import rl_zoo3.enjoy
@@ -11,14 +13,17 @@ from rl_zoo3.utils import get_model_path
 from sb3_dtfm.zoo.manager import OfflineExperimentManager
 
 
-def train(arguments: Sequence[str]) -> None:
+def train(arguments: Sequence[str], resumed: Path | None = None) -> None:
     """
     Train through :class:`OfflineExperimentManager`.
 
     :param arguments: of RL-Zoo's `train`
+    :param resumed: folder of an interrupted run to go on with
     :raises TrainingError: training failed in its midst
+    :raises SystemExit: SIGTERM has ended it, after what there is was saved
     """
-    rl_zoo3.train.ExperimentManager = OfflineExperimentManager  # type: ignore[misc]
+    manager = functools.partial(OfflineExperimentManager, arguments=list(arguments), resumed=resumed)
+    rl_zoo3.train.ExperimentManager = manager  # type: ignore[misc,assignment]
     _call(rl_zoo3.train.train, "train", arguments)
 
 

@@ -1,17 +1,23 @@
 """RL-Zoo's experiment: its way from settings to a trained model."""
 
 import contextlib
+import functools
 import os
 import shutil
-from typing import Any
+import signal
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback
 
 from sb3_dtfm.algorithms import ALGORITHMS
-from sb3_dtfm.callbacks import EvaluateAtStartAndEnd
+from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.distributed import is_first_process
+from sb3_dtfm.zoo.resuming import CHECKPOINT, KeepCheckpoint, Start, StopSignals, go_on
 
 
 class TrainingError(RuntimeError):
@@ -25,7 +31,25 @@ class OfflineExperimentManager(ExperimentManager):
     - A run that ends before it has a model leaves no folder, where `enjoy` would look for the latest run.
     - dt and dtfm are evaluated before the first gradient step and after the last one too.
     - Of the processes of one training, the first alone runs callbacks.
+    - They keep a checkpoint while they train, and a run goes on from it.
+
+    :param arguments: what RL-Zoo's `train` was called with
+    :param resumed: folder of a run to go on with, instead of a new one
     """
+
+    def __init__(self, *args: Any, arguments: Sequence[str] = (), resumed: Path | None = None, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.signals = StopSignals(between_steps=self.algo in ALGORITHMS)
+        self.keeper: KeepCheckpoint | None = None
+        # RL-Zoo draws a seed where none is given; the last one that is given counts.
+        self.start = Start([*arguments, "--seed", str(self.seed)])
+        self.resumed = resumed
+        if resumed is not None:
+            self.start = self.start._replace(tensorboard=Start.read(resumed).tensorboard)
+            if is_first_process():  # what others write is not kept
+                self.save_path, self.params_path = str(resumed), str(resumed / self.env_name)
+            self.trained_agent = str(resumed / CHECKPOINT)
+            self.continue_training = (resumed / CHECKPOINT).is_file()  # else it was killed before the first one
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """RL-Zoo's, which makes the run's folder before its model."""
@@ -43,19 +67,50 @@ class OfflineExperimentManager(ExperimentManager):
             self.callbacks = []
             return
         super().create_callbacks()
+        if self.algo not in ALGORITHMS or self.optimize_hyperparameters:
+            return
         evaluations = [callback for callback in self.callbacks if isinstance(callback, EvalCallback)]
-        if evaluations and self.algo in ALGORITHMS:
-            self.callbacks.append(EvaluateAtStartAndEnd(evaluations))
+        first = self.callbacks.index(evaluations[0]) if evaluations else 0
+        self.callbacks.insert(first, SeedEvaluations(evaluations, self.seed))
+        self.keeper = KeepCheckpoint(Path(self.save_path), self.signals, self.start)
+        self.callbacks += [EvaluateAtStartAndEnd(evaluations), self.keeper]
 
     def learn(self, model: BaseAlgorithm) -> None:
         """
-        RL-Zoo's.
+        RL-Zoo's; a run that is resumed has the rest of its steps before it.
 
         :param model: to train
         :raises TrainingError: whatever went wrong
         """
+        learning = model
         try:
-            super().learn(model)
+            if self.resumed is not None:
+                go_on(model, self.callbacks, self.start)
+                self.n_timesteps -= model.num_timesteps
+                learn = functools.partial(model.learn, reset_num_timesteps=model.num_timesteps == 0)
+                learning = cast(BaseAlgorithm, SimpleNamespace(learn=learn, env=model.env))  # all that RL-Zoo asks for
+            with self.signals.caught():
+                super().learn(learning)
         except Exception as error:
+            if self.signals.asked:  # Ctrl-C reaches the environments' processes, too
+                return
             message = f"Training ended after {model.num_timesteps} timesteps: {type(error).__name__}: {error}"
             raise TrainingError(message) from error
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        """
+        RL-Zoo's. An interrupted run keeps what it can go on from, a finished one does not.
+
+        :param model: trained
+        :raises SystemExit: SIGTERM has ended the run
+        """
+        super().save_trained_model(model)
+        interrupted = self.signals.asked and model.num_timesteps < model._total_timesteps
+        if self.keeper is not None and not interrupted:
+            self.keeper.remove()
+        elif self.keeper is not None:
+            if not self.signals.at_once:  # in the midst of a step
+                self.keeper.save()
+            print(f"Interrupted after {model.num_timesteps} steps; sb3-dtfm train --resume {self.save_path} goes on.")
+        if interrupted and self.signals.terminated:
+            raise SystemExit(128 + signal.SIGTERM)

@@ -246,7 +246,7 @@ def test_a_policy_of_ones_own_does_not_hide_the_algorithm(tmp_path: Path):
 
 def test_a_file_that_holds_no_agent_is_refused(tmp_path: Path):
     (tmp_path / "text.zip").write_text("no zip")
-    with pytest.raises(ValueError, match=r"text.zip holds no Stable-Baselines3 agent"):
+    with pytest.raises(ValueError, match=r"text.zip: no model of Stable-Baselines3"):
         load_agent("ppo", tmp_path / "text.zip", "cpu")
 
 

@@ -1,0 +1,179 @@
+"""A run that goes on where it was interrupted: the same folder, one curve, every step as if nothing had happened."""
+
+import contextlib
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch.distributed as dist
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.logger import TensorBoardOutputFormat, configure
+from torch.utils.tensorboard import SummaryWriter
+
+from sb3_dtfm.callbacks import EvaluateAtStartAndEnd
+from sb3_dtfm.files import replacing
+from sb3_dtfm.zoo.arguments import UsageError
+
+# In a run's folder while it is unfinished: the model as it was, and how the run was started.
+CHECKPOINT, START = "checkpoint.zip", "start.json"
+CHECKPOINT_INTERVAL = 60.0  # seconds of training that a killed run loses at most
+STOPPING = b"\nStopping after this gradient step, or the evaluation that runs; once more stops at once.\n"
+
+
+class Start(NamedTuple):
+    """
+    How a run was started.
+
+    :param arguments: of RL-Zoo's `train`
+    :param tensorboard: folder of its curves, None for none
+    """
+
+    arguments: list[str]
+    tensorboard: str | None = None
+
+    def write(self, run: Path) -> None:
+        """
+        :param run: the run's folder
+        """
+        with replacing(run / START) as path:
+            path.write_text(json.dumps(self._asdict(), indent=1))
+
+    @classmethod
+    def read(cls, run: Path) -> "Start":
+        """
+        :param run: the run's folder
+        :raises UsageError: no run of this package's `train`, or one that is finished
+        """
+        if not run.is_dir():
+            raise UsageError(f"--resume {run}: no such folder; expected that of a run, as logs/dtfm/HalfCheetah-v5_1.")
+        if not (run / START).is_file():
+            raise UsageError(
+                f"--resume {run}: nothing to go on with; the run is finished, or `sb3-dtfm train` did not start it."
+            )
+        try:
+            start = cls(**json.loads((run / START).read_text()))
+        except (ValueError, TypeError) as error:
+            raise UsageError(f"--resume {run}: {START} is damaged: {error}.") from error
+        return start
+
+
+class StopSignals:
+    """
+    Ctrl-C and SIGTERM end training between two gradient steps: what is saved is a state that training can go on from.
+
+    The second one interrupts at once. Where several processes train together, signals do what they did.
+
+    :param between_steps: False where nobody looks at `asked` between steps: the first one interrupts at once, too
+    """
+
+    def __init__(self, between_steps: bool) -> None:
+        self.between_steps = between_steps
+        self.asked = False
+        self.terminated = False
+        self.at_once = False
+
+    @contextlib.contextmanager
+    def caught(self) -> Iterator[None]:
+        """While training."""
+        if dist.is_initialized() or threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        before = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def _ask(self, number: int, _: Any) -> None:
+        self.terminated |= number == signal.SIGTERM
+        self.at_once = self.asked or not self.between_steps
+        self.asked = True
+        if self.at_once:
+            raise KeyboardInterrupt
+        os.write(2, STOPPING)
+
+
+class KeepCheckpoint(BaseCallback):
+    """
+    Saves the model now and then, and ends training where that was asked for. Put it behind all other callbacks.
+
+    :param run: the run's folder
+    :param signals: that may ask for an end
+    :param start: how the run was started
+    """
+
+    def __init__(self, run: Path, signals: StopSignals, start: Start) -> None:
+        super().__init__()
+        self.path = run / CHECKPOINT
+        self.signals = signals
+        self.start = start
+        self._saved_at = 0.0
+        self._ending = False
+
+    def _on_training_start(self) -> None:
+        self._saved_at = time.monotonic()
+        self.start._replace(tensorboard=self.logger.dir).write(self.path.parent)
+
+    def _on_step(self) -> bool:
+        if self._ending:
+            raise KeyboardInterrupt
+        self._ending = self.signals.asked  # a step later, when what follows an evaluation is logged, too
+        if time.monotonic() - self._saved_at >= CHECKPOINT_INTERVAL:
+            self.save()
+        return True
+
+    def save(self) -> None:
+        """Save the model as it is."""
+        self.model.save(self.path)
+        self._saved_at = time.monotonic()
+
+    def remove(self) -> None:
+        """The run is finished: nothing to go on from."""
+        self.path.unlink(missing_ok=True)
+        (self.path.parent / START).unlink(missing_ok=True)
+
+
+def go_on(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], start: Start) -> None:
+    """
+    Have logs and evaluations of a run follow those that there are, as far as the checkpoint.
+
+    :param model: of the checkpoint, or new where there was none
+    :param callbacks: of the run
+    :param start: how it was started
+    """
+    n_steps = model.num_timesteps
+    for callback in callbacks if n_steps else ():
+        callback.n_calls = n_steps  # one a gradient step
+        if isinstance(callback, EvaluateAtStartAndEnd):
+            callback.go_on(n_steps)
+        elif isinstance(callback, EvalCallback) and callback.log_path is not None:
+            _take_up_evaluations(callback, Path(f"{callback.log_path}.npz"), n_steps)
+    if start.tensorboard is not None:
+        logger = configure(start.tensorboard, ["stdout", "tensorboard"] if model.verbose else ["tensorboard"])
+        for output in logger.output_formats:
+            if isinstance(output, TensorBoardOutputFormat):
+                output.writer.close()
+                # What the interrupted run had logged behind its checkpoint is then left out.
+                output.writer = SummaryWriter(start.tensorboard, purge_step=n_steps + 1 if n_steps else 0)
+        model.set_logger(logger)
+
+
+def _take_up_evaluations(callback: EvalCallback, path: Path, num_timesteps: int) -> None:
+    """Those up to the checkpoint; the run comes to the others again."""
+    try:
+        with np.load(path, allow_pickle=False) as saved:
+            kept = {name: saved[name][saved["timesteps"] <= num_timesteps].tolist() for name in saved.files}
+    except (OSError, ValueError, KeyError, EOFError):  # none yet, or cut off by the kill
+        return
+    callback.evaluations_timesteps = kept["timesteps"]
+    callback.evaluations_results, callback.evaluations_length = kept["results"], kept["ep_lengths"]
+    callback.evaluations_successes = kept.get("successes", [])
+    callback.best_mean_reward = max(map(np.mean, kept["results"]), default=-np.inf)

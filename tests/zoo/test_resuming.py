@@ -1,0 +1,146 @@
+"""`sb3-dtfm train --resume`: a run that was ended or killed becomes what it would have been."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from sb3_dtfm import DTFM
+from sb3_dtfm.cli.main import main
+from sb3_dtfm.zoo.resuming import CHECKPOINT, START
+from tests.recorded import DATASET_ID, tiny_training
+
+RUN = Path("logs/dtfm/HalfCheetah-v5_1")
+N_STEPS, SIGNAL_AT, KILL_AT = 40, 17, 26
+SETTINGS = ["--dataset", DATASET_ID, "-n", str(N_STEPS), "--conf-file", "small", "-tb", "tb", "--log-interval", "5"]
+SETTINGS += ["--eval-freq", "10", "--eval-episodes", "2", "--vec-env", "dummy"]
+
+
+class SignalAt(BaseCallback):
+    """Sends this process a signal during some gradient step."""
+
+    def __init__(self, step: int, number: int) -> None:
+        super().__init__()
+        self.step, self.number = step, number
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.step:
+            os.kill(os.getpid(), self.number)
+        return True
+
+
+def training(*callbacks: tuple[int, int]) -> list[str]:
+    """The command; seeds are drawn by RL-Zoo unless a test says otherwise."""
+    signals = [{"tests.zoo.test_resuming.SignalAt": {"step": step, "number": int(number)}} for step, number in callbacks]
+    return tiny_training("dtfm", *([f"callback:{signals!r}"] if signals else []), *SETTINGS, "--seed", "3")
+
+
+def weights(path: Path) -> th.Tensor:
+    model = DTFM.load(path)
+    states = model.policy.optimizer.state_dict()["state"].values()
+    return th.cat([x.flatten() for x in (*model.policy.state_dict().values(), *(x for s in states for x in s.values()))])
+
+
+def curves() -> dict[str, list[tuple[int, float]]]:
+    """What TensorBoard shows, but for the time, of the only run."""
+    (folder,) = Path("tb/HalfCheetah-v5").iterdir()
+    events = EventAccumulator(str(folder)).Reload()
+    names = [name for name in events.Tags()["scalars"] if not name.startswith("time/")]
+    return {name: [(event.step, event.value) for event in events.Scalars(name)] for name in names}
+
+
+def evaluations() -> dict[str, list]:
+    with np.load(RUN / "evaluations.npz") as saved:
+        return {name: saved[name].tolist() for name in saved.files}
+
+
+def what_was_learned() -> tuple[th.Tensor, th.Tensor, dict, dict]:
+    return weights(RUN / "HalfCheetah-v5.zip"), weights(RUN / "best_model.zip"), curves(), evaluations()
+
+
+def assert_same(ours, theirs):
+    for one, other in zip(ours[:2], theirs[:2], strict=True):
+        assert th.equal(one, other)
+    assert ours[2] == theirs[2]
+    assert ours[3] == theirs[3]
+
+
+@pytest.fixture(scope="module")
+def straight(minari_folder, tmp_path_factory):
+    """What an undisturbed run comes to."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("straight"))
+        patch.setenv("MINARI_DATASETS_PATH", str(minari_folder))
+        assert main(training()) == 0
+        expected = what_was_learned()
+    assert [step for step, _ in expected[2]["train/loss"]] == list(range(5, N_STEPS + 1, 5))
+    assert expected[3]["timesteps"] == list(range(0, N_STEPS + 1, 10))
+    return expected
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+def test_an_interrupted_run_goes_on_in_its_folder_to_the_bit(number, code, straight, workplace, capsys):
+    if code:
+        with pytest.raises(SystemExit) as ended:
+            main(training((SIGNAL_AT, number)))
+        assert ended.value.code == code
+    else:
+        assert main(training((SIGNAL_AT, number))) == 0
+    assert f"--resume {RUN}" in capsys.readouterr().out
+    assert DTFM.load(RUN / CHECKPOINT).num_timesteps == SIGNAL_AT + 1
+    assert DTFM.load(RUN / "HalfCheetah-v5.zip").num_timesteps == SIGNAL_AT + 1
+    assert main(["train", "--resume", str(RUN)]) == 0
+    assert_same(what_was_learned(), straight)
+    assert not (RUN / CHECKPOINT).exists()
+    assert [path.name for path in Path("logs/dtfm").iterdir()] == [RUN.name]
+    assert main(["train", "--resume", str(RUN)]) == 2
+    assert "the run is finished" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("interval", [0.0, 1e9])
+def test_a_killed_run_goes_on_from_its_last_checkpoint_or_from_the_start(interval, straight, workplace):
+    """Killed behind a log entry and an evaluation that its checkpoint does not know: they are not there twice."""
+    script = (
+        "import torch; torch.set_num_threads(1)\n"
+        "import sb3_dtfm.zoo.resuming as resuming\nfrom sb3_dtfm.cli.main import main\n"
+        "save = resuming.KeepCheckpoint.save\n"
+        f"resuming.CHECKPOINT_INTERVAL = {interval}\n"
+        "resuming.KeepCheckpoint.save = lambda keeper: save(keeper) if keeper.num_timesteps <= 18 else None\n"
+        f"main({training((KILL_AT, signal.SIGKILL))!r})\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    killed = subprocess.run([sys.executable, "-c", script], env=environment, stdout=subprocess.DEVNULL)
+    assert killed.returncode == -signal.SIGKILL
+    assert (RUN / START).is_file()
+    assert (RUN / CHECKPOINT).is_file() == (interval == 0.0)
+    assert main(["train", "--resume", str(RUN), *training()[1:]]) == 0
+    assert_same(what_was_learned(), straight)
+
+
+def test_a_run_without_a_seed_goes_on_with_the_one_that_was_drawn(workplace):
+    arguments = [argument for argument in training((SIGNAL_AT, signal.SIGINT)) if argument not in ("--seed", "3")]
+    assert main(arguments) == 0
+    seed = DTFM.load(RUN / CHECKPOINT).seed
+    assert main(["train", "--resume", str(RUN)]) == 0
+    model = DTFM.load(RUN / "HalfCheetah-v5.zip")
+    assert (model.seed, model.num_timesteps) == (seed, N_STEPS)
+
+
+@pytest.mark.parametrize(
+    ("run", "message"),
+    [
+        ("logs/dtfm/absent_1", "no such folder"),
+        (".", "nothing to go on with"),
+    ],
+)
+def test_what_cannot_be_resumed_is_said(run, message, workplace, capsys):
+    assert main(["train", "--resume", run]) == 2
+    assert f"--resume {run}" in (error := capsys.readouterr().err)
+    assert message in error
