@@ -12,6 +12,7 @@ import torch as th
 from gymnasium import spaces
 from minari.serialization import deserialize_space, serialize_space
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
 from sb3_dtfm.arguments import COUNT, Number, Rule, check_arguments
@@ -169,36 +170,30 @@ def from_configuration(
         if hasattr(algorithm, name) or name in (*ENCODED, "policy", "device", "env"):
             raise ModelFileError(f"{source}: {name} is no attribute that a model is saved with.")
     attributes.update({name: _space(taken(name, str), f"{source}: {name}") for name in SPACES})
-    if not isinstance(attributes.get("policy_kwargs", {}), dict):
-        raise ModelFileError(f"{source}: policy_kwargs are {attributes['policy_kwargs']!r}, expected arguments by name.")
     attributes["_means"] = _to_means(taken("means", dict), source)
-    attributes.update(custom_objects)
-    if "learning_rate" not in custom_objects:
-        attributes["learning_rate"] = _to_learning_rate(taken("learning_rate", (int, float, str, dict)), source)
+    attributes["learning_rate"] = _to_learning_rate(taken("learning_rate", (int, float, str, dict)), source)
     if "policy_class" not in custom_objects:
-        name = taken("policy_class", str)
-        if name not in algorithm.policy_aliases:
-            raise ModelFileError(
-                f"{source}: its policy is a {name}, a class that a file does not hold; "
-                f"give it, load(path, custom_objects={{'policy_class': {name}}})."
-            )
-        attributes["policy_class"] = algorithm.policy_aliases[name]
-    _check_spaces(attributes, source)
-    try:
-        check_arguments({**dict.fromkeys(COUNTERS, 1), **attributes}, COUNTERS)  # one may have been left out
-    except ValueError as error:
-        raise ModelFileError(f"{source}: {error}") from error
+        attributes["policy_class"] = _policy_class(algorithm, taken("policy_class", str), source)
+    attributes.update(custom_objects)
+    _check_attributes(attributes, source)
     return attributes
 
 
-def _space(described: str, what: str) -> spaces.Space:
-    try:
-        return deserialize_space(described)
-    except Exception as error:  # whatever Gymnasium raises for numbers that make no space
-        raise ModelFileError(f"{what} is no space: {error!r}.") from error
+def _policy_class(algorithm: type[BaseAlgorithm], name: str, source: str) -> type[BasePolicy]:
+    if name not in algorithm.policy_aliases:
+        raise ModelFileError(
+            f"{source}: its policy is a {name}, a class that a file does not hold; "
+            f"give it, load(path, custom_objects={{'policy_class': {name}}})."
+        )
+    return algorithm.policy_aliases[name]
 
 
-def _check_spaces(attributes: Mapping[str, Any], source: str) -> None:
+def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
+    """What is not checked as arguments are."""
+    if not isinstance(attributes.get("policy_kwargs", {}), dict):
+        raise ModelFileError(f"{source}: policy_kwargs are {attributes['policy_kwargs']!r}, expected arguments by name.")
+    with naming_the_file(source):
+        check_arguments({**dict.fromkeys(COUNTERS, 1), **attributes}, COUNTERS)  # one may have been left out
     observation, action = attributes["observation_space"], attributes["action_space"]
     parts = observation.spaces if isinstance(observation, spaces.Dict) else {}
     is_vector = {name: isinstance(part, spaces.Box) and len(part.shape) == 1 for name, part in parts.items()}
@@ -207,6 +202,13 @@ def _check_spaces(attributes: Mapping[str, Any], source: str) -> None:
     bounded = isinstance(action, spaces.Box) and len(action.shape) == 1 and action.is_bounded()
     if not bounded or not np.all(action.low < action.high):
         raise ModelFileError(f"{source}: action_space is {action}, expected a bounded Box of shape (A,).")
+
+
+def _space(described: str, what: str) -> spaces.Space:
+    try:
+        return deserialize_space(described)
+    except Exception as error:  # whatever Gymnasium raises for numbers that make no space
+        raise ModelFileError(f"{what} is no space: {error!r}.") from error
 
 
 def _to_learning_rate(saved: Any, source: str) -> Any:

@@ -14,8 +14,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_dtfm.benchmark import provenance
-from sb3_dtfm.benchmark.rows import Row, write_row
+from sb3_dtfm.benchmark.rows import Row, read_rows, write_row
 from sb3_dtfm.envs.success import reported_success
+from sb3_dtfm.files import replacing
 
 # First seeds of the two sets of initial states: apart from each other, and from those of recordings, which count from 0.
 TRAINING_STATES = 1_000_000
@@ -158,7 +159,19 @@ class EvaluationCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._resumed = time.perf_counter()
-        self._evaluate(final=False)
+        if self.num_timesteps == 0:
+            self._evaluate(final=False)
+        else:
+            self._take_up_rows()
+
+    def _take_up_rows(self) -> None:
+        """Those of an interrupted run up to its checkpoint; steps behind the last row took as long as those before it."""
+        rows = [row for row in read_rows(self.rows) if row["step"] <= self.num_timesteps]
+        with replacing(self.rows) as beside:
+            for row in rows:
+                write_row(beside, row)
+        timed = next((row for row in reversed(rows) if row["step"] > 0), None)
+        self._training_seconds = timed["wall_s"] * self.num_timesteps / timed["step"] if timed else 0.0
 
     def _on_step(self) -> bool:
         self._report("training")

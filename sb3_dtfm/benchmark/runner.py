@@ -18,16 +18,19 @@ from typing import Any
 
 import yaml
 from filelock import FileLock, Timeout
+from huggingface_sb3 import EnvironmentName
 from tqdm import tqdm
 
 from sb3_dtfm.benchmark.evaluation import PROGRESS
 from sb3_dtfm.benchmark.grid import Job
 from sb3_dtfm.benchmark.provenance import n_cores
 from sb3_dtfm.benchmark.rows import RowError, finished_cells, read_rows
+from sb3_dtfm.files import replacing
+from sb3_dtfm.zoo.resuming import START
 
 TRAIN = [sys.executable, "-m", "sb3_dtfm", "train"]
 CALLBACK = "sb3_dtfm.benchmark.evaluation.EvaluationCallback"
-ROWS, SETTINGS, OUTPUT = "rows.jsonl", "settings.yml", "output.log"
+ROWS, SETTINGS, OUTPUT, LOGS = "rows.jsonl", "settings.yml", "output.log", "logs"
 PATIENCE = 10.0  # seconds that a process has to end after SIGTERM
 
 
@@ -80,10 +83,14 @@ class Runner:
             self.left.append(job)
 
     def _prepare(self, job: Job) -> Path:
-        """A folder with a cell's settings, new for each attempt: an orphan may still be writing into an older one."""
+        """
+        A folder with a cell's settings, new for each attempt: an orphan may still be writing into an older one.
+
+        What the last attempt had come to is copied, if its settings were the same.
+        """
         logs, options = Path(self.options.log_folder) / job.cell.file_name, self.options
-        shutil.rmtree(logs, ignore_errors=True)
         logs.mkdir(parents=True, exist_ok=True)
+        earlier = sorted(logs.glob("attempt-*"), key=lambda path: path.stat().st_mtime)
         folder = Path(tempfile.mkdtemp(prefix="attempt-", dir=logs))
         arguments = {
             "rows": str(folder / ROWS),
@@ -96,7 +103,15 @@ class Runner:
         }
         own = job.settings.get("callback") or []
         callbacks = [*(own if isinstance(own, list) else [own]), {CALLBACK: arguments}]
-        (folder / SETTINGS).write_text(yaml.safe_dump({job.cell.task: {**job.settings, "callback": callbacks}}))
+        settings = yaml.safe_dump({job.cell.task: {**job.settings, "callback": callbacks}})
+        (folder / SETTINGS).write_text(settings)
+        for attempt in earlier[-1:]:
+            with contextlib.suppress(OSError):  # killed before it had anything
+                if (attempt / SETTINGS).read_text().replace(str(attempt), str(folder)) == settings:
+                    shutil.copytree(attempt / LOGS, folder / LOGS)
+                    shutil.copyfile(attempt / ROWS, folder / ROWS)
+        for attempt in earlier:
+            shutil.rmtree(attempt, ignore_errors=True)
         return folder
 
     def _train(self, job: Job, folder: Path) -> None:
@@ -120,8 +135,13 @@ class Runner:
         :raises CancelledError: the grid is being ended
         """
         command = [*TRAIN, "--algo", job.cell.algo, "--env", job.cell.task, "--seed", str(job.cell.seed)]
-        command += ["--conf-file", str(folder / SETTINGS), "--log-folder", str(folder / "logs"), "--eval-freq", "-1"]
+        command += ["--conf-file", str(folder / SETTINGS), "--log-folder", str(folder / LOGS), "--eval-freq", "-1"]
         command += ["--verbose", "0", "--device", self.options.device, "--num-threads", str(self._n_threads)]
+        run = (
+            folder / LOGS / job.cell.algo / f"{EnvironmentName(job.cell.task)}_1"
+        )  # RL-Zoo's name for an attempt's only run
+        if (run / START).is_file() and (folder / ROWS).is_file():
+            command += ["--resume", str(run)]
         if self.options.gym_packages:
             command += ["--gym-packages", *self.options.gym_packages]
         environment = {key: value for key, value in os.environ.items() if key not in ("RANK", "WORLD_SIZE")}
@@ -162,9 +182,8 @@ class Runner:
                 return False
         except (FileNotFoundError, RowError):
             return False
-        beside = self.results / f".{job.cell.file_name}.part"  # the logs may lie in another file system
-        shutil.copyfile(rows, beside)
-        beside.replace(self.results / f"{job.cell.file_name}.jsonl")
+        with replacing(self.results / f"{job.cell.file_name}.jsonl") as beside:
+            shutil.copyfile(rows, beside)
         return True
 
     def _end_processes(self) -> None:

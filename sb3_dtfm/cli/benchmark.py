@@ -19,7 +19,7 @@ The file of --datasets maps a task to its dataset, or to dataset, target_return 
   robosuite/Lift-v0: datasets/lift.hdf5
   HalfCheetah-v5: {dataset: local/halfcheetah/expert-v0, target_return: 13000, recorded_from: "TQC, sampled actions"}
 
-A cell that is finished in the results folder is not run again; one that was interrupted starts anew.
+A cell that is finished in the results folder is not run again; one that was interrupted goes on from its checkpoint.
 """
 
 

@@ -17,6 +17,7 @@ from sb3_dtfm import DTFM
 from sb3_dtfm.benchmark.report.statistics import wilson
 from sb3_dtfm.cli import train
 from sb3_dtfm.cli.plot import plot_learning_curve
+from sb3_dtfm.files import replacing
 from sb3_dtfm.recording.demonstrations import record_demonstrations
 
 ENV_ID = "robosuite/Lift-v0"
@@ -154,7 +155,8 @@ def evaluate_if_missing(run_folder: Path, n_episodes: int) -> dict[str, Any]:
         "mean_length": sum(lengths) / len(lengths),
         "seed": EVALUATION_SEED,
     }
-    path.write_text(json.dumps(result, indent=2) + "\n")
+    with replacing(path) as beside:
+        beside.write_text(json.dumps(result, indent=2) + "\n")
     return result
 
 

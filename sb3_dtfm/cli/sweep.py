@@ -18,6 +18,7 @@ from sb3_dtfm.benchmark.provenance import commit, versions
 from sb3_dtfm.benchmark.report.statistics import Interval, student_t
 from sb3_dtfm.data import load_dataset
 from sb3_dtfm.envs import ReturnToGoWrapper
+from sb3_dtfm.files import replacing
 from sb3_dtfm.recording.loading import AgentFiles, algorithm_of, find_agent, load_agent
 from sb3_dtfm.zoo.arguments import UsageError, import_packages, key_values
 
@@ -74,7 +75,10 @@ def main(argv: Sequence[str]) -> None:
     numbers = picture.with_suffix(".json")
     origin = {"task": options.env, "dataset": options.dataset, "acting": acting, "first_state": first_state(options)}
     asked = {name: [each._asdict() for each in reached] for name, reached in curves.items()}
-    numbers.write_text(json.dumps({**origin, "commit": commit(), "versions": versions(), "models": asked}, indent=1) + "\n")
+    with replacing(numbers) as beside:
+        beside.write_text(
+            json.dumps({**origin, "commit": commit(), "versions": versions(), "models": asked}, indent=1) + "\n"
+        )
     print(f"\nPicture: {picture}\nReturns of all episodes: {numbers}")
 
 

@@ -2,7 +2,6 @@
 
 import json
 import os
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from sb3_dtfm.files import replacing
 from sb3_dtfm.recording.episodes import RecordedEpisode, stack_observations
 
 VALIDATION_SHARE = 0.1
@@ -36,25 +36,13 @@ def write_robomimic(
     :param env_args: description of the environment, stored as JSON
     :param seed: of the filter keys `train`, `valid` (a tenth) and `50_percent`
     """
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        with h5py.File(temporary, "w") as file:
-            data = file.create_group("data")
-            lengths = [_write_demo(data, f"demo_{number}", episode) for number, episode in enumerate(episodes)]
-            data.attrs["total"] = sum(lengths)
-            data.attrs["env_args"] = json.dumps(env_args, indent=4)
-            for key, chosen in _filter_keys(len(lengths), seed).items():
-                file[f"mask/{key}"] = np.array([f"demo_{number}" for number in np.sort(chosen)], dtype="S")
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o666 & ~mask)  # a temporary file is private to its owner, an ordinary one is not
-        os.replace(temporary, target)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as beside, h5py.File(beside, "w") as file:
+        data = file.create_group("data")
+        lengths = [_write_demo(data, f"demo_{number}", episode) for number, episode in enumerate(episodes)]
+        data.attrs["total"] = sum(lengths)
+        data.attrs["env_args"] = json.dumps(env_args, indent=4)
+        for key, chosen in _filter_keys(len(lengths), seed).items():
+            file[f"mask/{key}"] = np.array([f"demo_{number}" for number in np.sort(chosen)], dtype="S")
 
 
 def _write_demo(data: h5py.Group, name: str, episode: RecordedEpisode) -> int:

@@ -296,3 +296,22 @@ def test_a_mistake_ends_in_one_clear_line_before_anything_runs(arguments, messag
     assert message in error[0]
     assert not Path("results").exists()
     assert not Path("logs").exists()
+
+
+def test_an_interrupted_cell_goes_on_from_its_checkpoint_to_the_same_rows(grid, workplace, monkeypatch):
+    """A cell loses nothing that a checkpoint holds."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
+    grid += ["--fractions", "0.5", "--algo", "dtfm"]
+    ends = {"tests.zoo.test_resuming.SignalAt": {"step": 3, "number": int(signal.SIGTERM)}}
+    (workplace / "ending.yml").write_text(yaml.safe_dump({"default": {**SETTINGS, "callback": ends}}))
+    disturbed = [{"tiny.yml": "ending.yml"}.get(argument, argument) for argument in grid]
+    assert main(grid) == 0
+    with pytest.raises(SystemExit):
+        main(disturbed)
+    logs = workplace / "logs" / "benchmark" / f"{TASK}_0.5_dtfm_seed0_ending"
+    assert [row["step"] for file in logs.glob("*/rows.jsonl") for row in read_rows(file)] == [0, 2, 4]
+    assert main(disturbed) == 0
+    straight, resumed = (read_rows(workplace / "results" / f"{TASK}_0.5_dtfm_seed0_{p}.jsonl") for p in ("tiny", "ending"))
+    assert [(row["step"], row["final"]) for row in resumed] == STEPS
+    assert [row["returns"] for row in resumed] == [row["returns"] for row in straight]
+    assert "Loading pretrained agent" in next(logs.glob("*/output.log")).read_text()

@@ -338,7 +338,7 @@ def test_a_damaged_file_is_refused_whatever_the_damage(saved, tmp_path):
 
 def test_parameters_of_another_model_are_refused_and_change_nothing(saved, cheetah_buffer, tmp_path):
     (tmp_path / "model.zip").write_bytes(saved)
-    model = make_model(DTFM, cheetah_buffer, policy_kwargs={"embed_dim": 32, "clip_return_to_go": True})
+    model = make_model(DTFM, cheetah_buffer, policy_kwargs={"embed_dim": 64, "n_heads": 1, "clip_return_to_go": True})
     before = {name: value.clone() for name, value in model.policy.state_dict().items()}
     with pytest.raises(ModelFileError, match="expected float32 of"):
         model.set_parameters(tmp_path / "model.zip")

@@ -1,0 +1,130 @@
+"""Killed at any moment: whatever a training, a recording or a cache leaves behind under its own name can be loaded."""
+
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch as th
+
+import sb3_dtfm.zoo.resuming as resuming
+from sb3_dtfm import DTFM
+from sb3_dtfm.benchmark.rows import read_rows
+from sb3_dtfm.cli.main import main
+from sb3_dtfm.data import load_dataset
+from tests.recorded import DATASET_ID, tiny_training
+
+N_KILLS = 20  # of each
+RUN = Path("logs/dtfm/HalfCheetah-v5_1")
+
+
+def kill_after(seconds: float, work: Callable[[], object]) -> bool:
+    """Do some work in a process of its own and kill that; False if it was done before."""
+    child = os.fork()
+    if child == 0:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 1)
+        os.dup2(nowhere, 2)
+        work()
+        os._exit(0)
+    time.sleep(seconds)
+    os.kill(child, signal.SIGKILL)
+    return os.WIFSIGNALED(os.waitpid(child, 0)[1])
+
+
+def kill_often(work: Callable[[], object], check: Callable[[], object], seed: int) -> None:
+    """Kill at random moments of the time that the work takes, and look at what is left each time."""
+    start = time.perf_counter()
+    assert not kill_after_the_end(work)
+    whole = time.perf_counter() - start
+    random = np.random.default_rng(seed)
+    n_killed = 0
+    for _ in range(N_KILLS):
+        n_killed += kill_after(float(random.uniform(0.0, whole)), work)
+        check()
+    assert n_killed >= N_KILLS // 2
+    assert not kill_after_the_end(work)
+    check()
+
+
+def kill_after_the_end(work: Callable[[], object]) -> bool:
+    child = os.fork()
+    if child == 0:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 1)
+        os.dup2(nowhere, 2)
+        work()
+        os._exit(0)
+    return os.waitpid(child, 0)[1] != 0
+
+
+@pytest.mark.slow
+def test_a_killed_training_leaves_models_that_load(workplace, monkeypatch):
+    """A checkpoint, a best model, a numbered one and the last one, all the time over those of the runs before."""
+    monkeypatch.setattr(resuming, "CHECKPOINT_INTERVAL", 0.0)
+    settings = ["--dataset", DATASET_ID, "--conf-file", "small", "--eval-freq", "3", "--eval-episodes", "1", "--seed", "0"]
+
+    def train() -> None:
+        resume = ["--resume", str(RUN)] if (RUN / resuming.START).is_file() else []
+        main([*tiny_training("dtfm", *settings, "--save-freq", "2"), "-n", "30", "--num-threads", "1", *resume])
+
+    def check() -> None:
+        for path in Path("logs").rglob("*.zip"):
+            DTFM.load(path)
+        for path in Path("logs").rglob("*.json"):
+            resuming.Start.read(path.parent)
+
+    kill_often(train, check, seed=0)
+    assert not list(RUN.glob(".*.part"))
+    assert th.isfinite(DTFM.load(RUN / "HalfCheetah-v5.zip").policy.state_dict()["noise_table"]).all()
+
+
+@pytest.mark.slow
+def test_a_killed_recording_leaves_the_one_before(workplace, minari_folder):
+    agent = str(minari_folder / "agent.zip")
+    name = "tests/halfcheetah/killed-v0"
+    record = ["record", "--algo", "ppo", "--model", agent, "--env", "HalfCheetah-v5", "--dataset-id", name, "--overwrite"]
+
+    def check() -> None:
+        if (minari_folder / name).exists():
+            assert load_dataset(name).n_episodes == 2
+
+    kill_often(lambda: main([*record, "--episodes", "2", "--n-envs", "2"]), check, seed=1)
+    assert load_dataset(name).n_episodes == 2
+    assert not [path for path in minari_folder.iterdir() if path.name.startswith(".recording-")]
+
+
+@pytest.mark.slow
+def test_a_killed_cache_is_built_again(workplace):
+    """Also one that takes the place of an outdated one."""
+    expected = load_dataset(DATASET_ID).rewards
+    seeds = iter(range(10**6))
+
+    def build() -> None:
+        for path in Path("cache").rglob("*.json"):
+            os.utime(path, ns=(0, next(seeds)))
+        load_dataset(DATASET_ID, cache_dir="cache")
+
+    kill_often(build, lambda: None, seed=2)
+    assert th.equal(load_dataset(DATASET_ID, cache_dir="cache").rewards, expected)
+
+
+def test_rows_and_files_of_hdf5_are_whole_or_as_before(tmp_path):
+    """What is written beside takes the place at the end, and only where nothing was raised."""
+    from sb3_dtfm.files import replacing
+
+    path = tmp_path / "file.hdf5"
+    for value in (1, 2):
+        with replacing(path) as beside, h5py.File(beside, "w") as file:
+            file.attrs["value"] = value
+    with pytest.raises(RuntimeError), replacing(path) as beside:
+        beside.write_text("half")
+        raise RuntimeError
+    with h5py.File(path) as file:
+        assert file.attrs["value"] == 2
+    assert [each.name for each in tmp_path.iterdir()] == ["file.hdf5"]
+    assert read_rows
