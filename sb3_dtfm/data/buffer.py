@@ -42,7 +42,7 @@ class TrajectoryBuffer:
     :ivar returns_to_go: (N,) float32, environment reward units
     :ivar episodes: the buffer's episodes, one row each
     :ivar env_id: Gymnasium id of the environment that they come from, None where nobody says
-    :ivar n_dropped: how many episodes `on_invalid="drop"` has left out
+    :ivar dropped: how many episodes `on_invalid="drop"` has left out, and why the first of them; None where it had none
     :ivar device: what batches are made for
     """
 
@@ -56,7 +56,7 @@ class TrajectoryBuffer:
         score_reference: ScoreReference | None = None,
         env_id: str | None = None,
         maps: Sequence[MappedSteps] = (),
-        n_dropped: int = 0,
+        dropped: tuple[int, str] | None = None,
     ) -> None:
         self.observations = tensors["observations"]
         self.actions = tensors["actions"]
@@ -67,10 +67,15 @@ class TrajectoryBuffer:
         self.source = source
         self.score_reference = score_reference
         self.env_id = env_id
-        self.n_dropped = n_dropped
+        self.dropped = dropped
         self._maps = maps
         self.device = self.observations.device
         self._set_episodes(episodes)
+        if dropped:
+            n_all = dropped[0] + len(episodes.lengths)
+            warnings.warn(
+                f"{source}: {dropped[0]} of {n_all} episodes have been dropped, the first for this: {dropped[1]}", stacklevel=2
+            )
 
     def _set_episodes(self, episodes: EpisodeTable) -> None:
         self.episodes = episodes
@@ -148,9 +153,6 @@ class TrajectoryBuffer:
         if observation_space is None or not rows:
             left = f" that could be kept of {len(dropped)} (the first: {dropped[0]})" if dropped else ""
             raise DatasetError(f"{source}: holds no episode{left}; at least one is needed.")
-        if dropped:
-            found = f"{len(dropped)} of {len(dropped) + len(rows)} episodes were dropped, the first for this: {dropped[0]}"
-            warnings.warn(f"{source}: {found}", stacklevel=2)
         return cls(
             storage.finish(),
             EpisodeTable(*(np.array(column) for column in zip(*rows, strict=True))),
@@ -159,7 +161,7 @@ class TrajectoryBuffer:
             source,
             score_reference,
             env_id,
-            n_dropped=len(dropped),
+            dropped=(len(dropped), str(dropped[0])) if dropped else None,
         )
 
     def __repr__(self) -> str:
@@ -177,6 +179,11 @@ class TrajectoryBuffer:
     @property
     def n_episodes(self) -> int:
         return len(self.episodes.lengths)
+
+    @property
+    def n_dropped(self) -> int:
+        """How many episodes `on_invalid="drop"` has left out."""
+        return self.dropped[0] if self.dropped else 0
 
     @property
     def episode_lengths(self) -> np.ndarray:

@@ -37,14 +37,14 @@ def open_hdf5(group: h5py.Group, name: str, where: str) -> tuple[h5py.h5d.Datase
     what = f"{where}: {name}"
     try:
         data = h5py.h5d.open(group.id, name.encode())
-    except (KeyError, TypeError, ValueError, OSError) as error:  # no such name, a group, a link into nothing
+    except (KeyError, TypeError, ValueError, OSError, RuntimeError) as error:  # no such name, a group, a link astray
         raise DatasetError(f"{where}: has no {name!r}, only {listed(group)}; the file is incomplete.") from error
     with naming(what):
         shape, dtype, n_stored = data.shape, data.dtype, data.get_storage_size()
         in_file = h5py.h5f.get_name(data) == h5py.h5f.get_name(group.id) and _stored_within(data)
     check_real(dtype, what)
-    if shape is None:
-        raise DatasetError(f"{what} have no shape; the file is damaged or incomplete.")
+    if not shape:
+        raise DatasetError(f"{what} have shape {shape}; one entry for each step is expected.")
     if not in_file:  # what is there can change without a trace, or be what nobody meant to give away
         raise DatasetError(f"{what} lie in another file; one file that holds everything is accepted.")
     n_bytes = int(math.prod(shape)) * dtype.itemsize

@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow.dataset
 from gymnasium import spaces
 from minari.dataset.minari_dataset import parse_dataset_id
+from minari.serialization import deserialize_space
 from minari.storage import get_dataset_path
 
 from sb3_dtfm.data.buffer import TrajectoryBuffer
@@ -43,6 +44,7 @@ FIELDS: dict[str, tuple[tuple[type, ...], bool]] = {
     "ref_min_score": ((int, float), False),
     "ref_max_score": ((int, float), False),
 }
+FORMATS = ("hdf5", "arrow", "parquet")
 # Entries of the vector that a step's observation, or action, becomes: no task has as many.
 MOST_ENTRIES = 2**20
 # Gives one of an episode's arrays by its name, followed by the keys of the parts of a Dict or Tuple that lead to it.
@@ -140,7 +142,7 @@ def open_minari(dataset_id: str) -> minari.MinariDataset:
     if not folder.exists():
         _download(dataset_id)
     read_metadata(folder, dataset_id)
-    with naming(f"Minari dataset {dataset_id} ({folder})"):
+    with naming(f"Minari dataset {dataset_id} ({folder / METADATA_FILE_NAME})"):
         return minari.load_dataset(dataset_id)
 
 
@@ -184,8 +186,16 @@ def read_metadata(folder: Path, dataset_id: str) -> dict[str, Any]:
     for name in ("observation_space", "action_space"):
         with naming(f"{source}: {name}"):
             n_entries = _n_entries(json.loads(metadata[name]))
-        if not n_entries <= MOST_ENTRIES:
-            raise DatasetError(f"{source}: {name} has {n_entries} entries; up to {MOST_ENTRIES} are accepted.")
+            if not n_entries <= MOST_ENTRIES:
+                raise DatasetError(f"{source}: {name} has {n_entries} entries; up to {MOST_ENTRIES} are accepted.")
+            deserialize_space(metadata[name])
+    for name in ("env_spec", "eval_env_spec"):
+        with naming(f"{source}: {name}"):
+            if metadata.get(name) is not None and not isinstance(json.loads(metadata[name]), dict):
+                raise DatasetError(f"{source}: {name} is {reprlib.repr(metadata[name])}; a JSON object is expected.")
+    if metadata["data_format"] not in FORMATS:
+        found = f"data_format is {reprlib.repr(metadata['data_format'])}"
+        raise DatasetError(f"{source}: {found}; accepted are {', '.join(FORMATS)}.")
     n_episodes = _n_episodes(folder, metadata["data_format"], dataset_id)
     if n_episodes != metadata["total_episodes"]:
         raise DatasetError(f"{source}: total_episodes is {metadata['total_episodes']}; there are {n_episodes} episodes.")
@@ -205,7 +215,7 @@ def _n_episodes(folder: Path, data_format: str, dataset_id: str) -> int:
     """How many episodes are there, whatever the metadata say."""
     data = folder / HDF5_FILE_NAME if data_format == "hdf5" else folder
     with naming(f"Minari dataset {dataset_id} ({data})"):
-        if data.is_dir():
+        if data_format != "hdf5":
             return sum(path.name.isdigit() for path in data.iterdir())
         with h5py.File(data, "r") as file:
             return sum(name.startswith("episode_") for name in file)
@@ -255,14 +265,15 @@ def _arrow_reader(data_format: str, folder: Path, source: str) -> Callable[[int]
         table.validate(full=True)
 
         def array(name: str, *path: str | int) -> np.ndarray:
-            values = table[name].combine_chunks()
-            for key in path:
-                values = values.field(str(key))
-            # Observations are one more than actions, so the other columns are stored with an entry that nobody gave.
-            values = values if name == "observations" else values[:-1]
-            if pyarrow.types.is_fixed_size_list(values.type):
+            with naming(f"{source}, episode {index}: {name}"):
+                values = table[name].combine_chunks()
+                for key in path:
+                    values = values.field(str(key))
+                # Observations are one more than actions: the other columns are stored with an entry that nobody gave.
+                values = values if name == "observations" else values[:-1]
+                if not pyarrow.types.is_fixed_size_list(values.type):
+                    return values.to_numpy(zero_copy_only=False)
                 return values.flatten().to_numpy(zero_copy_only=False).reshape(len(values), -1)
-            return values.to_numpy(zero_copy_only=False)
 
         return array
 
@@ -323,7 +334,7 @@ def _flatten_observations(read: ReadArray, path: tuple[str | int, ...], space: s
         raise DatasetError(f"{where}: {name} have shape {values.shape}, expected (steps, {', '.join(map(str, space.shape))}).")
     if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
         return [np.stack([_one_hot(space, value, f"{where}: {name}") for value in values])]
-    return [values.reshape(len(values), -1)]
+    return [values.reshape(len(values), size)]
 
 
 def _one_hot(space: spaces.Space, value: Any, where: str) -> np.ndarray:

@@ -207,7 +207,7 @@ def _told_stops(arrays: _Arrays, name: str, n_steps: int) -> np.ndarray:
     array = arrays.read((name,))
     with np.errstate(invalid="ignore"):
         numbers = array.reshape(-1).astype(np.int64)
-    if array.size != array.shape[:1][0] or not (numbers == array.reshape(-1)).all():
+    if array.shape[:1] != (array.size,) or not (numbers == array.reshape(-1)).all():
         raise DatasetError(f"{arrays.source}: {name} holds {array.dtype} of shape {array.shape}; whole numbers (E,) are expected.")
     lengths = np.diff(numbers, prepend=0) if name == ENDS else numbers
     unfit = (lengths <= 0) | (lengths > n_steps)

@@ -135,6 +135,8 @@ def _read(
                 name=name,
             )
 
+    with naming(f"{source}: attribute 'env_args' of group 'data'"):
+        env_id = env_id_from_robomimic(env_args)
     n_actions = next((labels[name].n_actions for name in demos if name in labels), None)
     if n_actions is None:
         raise refused[demos[0]]
@@ -143,7 +145,7 @@ def _read(
         action_space=_action_space(env_args, n_actions, source),
         n_steps=sum(len(rewards[name]) for name in demos if name in rewards),
         source=source,
-        env_id=env_id_from_robomimic(env_args),
+        env_id=env_id,
         storage=storage,
         on_invalid=on_invalid,
         n_stored=os.path.getsize(source),
@@ -227,10 +229,10 @@ def _rewards(labels: dict[str, _Labels]) -> dict[str, np.ndarray]:
 def _observations(demo: h5py.Group, where: str, n_steps: int, keys: tuple[str, ...]) -> np.ndarray:
     """The chosen observations side by side, (T, O)."""
     group = open_group(demo, "obs", where)
-    parts = []
+    names, parts = set(group), []
     for key in keys:
-        name = key if key in group else ALIASES.get(key, key)
-        if name not in group:
+        name = key if key in names else ALIASES.get(key, key)
+        if name not in names:
             raise DatasetError(f"{where}: has no observation {key!r}; available: {listed(group)}.")
         array = read_hdf5(group, name, where)
         if array.ndim == 1:
