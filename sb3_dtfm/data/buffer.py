@@ -74,7 +74,8 @@ class TrajectoryBuffer:
         if dropped:
             n_all = dropped[0] + len(episodes.lengths)
             warnings.warn(
-                f"{source}: {dropped[0]} of {n_all} episodes have been dropped, the first for this: {dropped[1]}", stacklevel=2
+                f"{source}: {dropped[0]} of {n_all} episodes have been dropped, the first for this: {dropped[1]}",
+                stacklevel=2,
             )
 
     def _set_episodes(self, episodes: EpisodeTable) -> None:

@@ -1,6 +1,5 @@
 """Arrays in hdf5 files that nobody vouches for: checked before a byte of them is read."""
 
-
 import math
 
 import h5py

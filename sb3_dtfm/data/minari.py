@@ -176,13 +176,7 @@ def read_metadata(folder: Path, dataset_id: str) -> dict[str, Any]:
         metadata = json.loads(path.read_text())
     if not isinstance(metadata, dict):
         raise DatasetError(f"{source}: holds a {type(metadata).__name__}; a JSON object is expected.")
-    for name, (kind, needed) in FIELDS.items():
-        value = metadata.get(name)
-        if type(value) not in kind and (needed or value is not None):
-            expected = " or ".join(one.__name__ for one in kind)
-            raise DatasetError(f"{source}: {name} is {reprlib.repr(value)}; expected is one of type {expected}.")
-        if isinstance(value, int | float) and not (math.isfinite(value) and (value >= 0 or name.startswith("ref"))):
-            raise DatasetError(f"{source}: {name} is {value}; a number is expected, and a count of at least 0.")
+    _check_fields(metadata, source)
     for name in ("observation_space", "action_space"):
         with naming(f"{source}: {name}"):
             n_entries = _n_entries(json.loads(metadata[name]))
@@ -193,13 +187,23 @@ def read_metadata(folder: Path, dataset_id: str) -> dict[str, Any]:
         with naming(f"{source}: {name}"):
             if metadata.get(name) is not None and not isinstance(json.loads(metadata[name]), dict):
                 raise DatasetError(f"{source}: {name} is {reprlib.repr(metadata[name])}; a JSON object is expected.")
-    if metadata["data_format"] not in FORMATS:
-        found = f"data_format is {reprlib.repr(metadata['data_format'])}"
-        raise DatasetError(f"{source}: {found}; accepted are {', '.join(FORMATS)}.")
     n_episodes = _n_episodes(folder, metadata["data_format"], dataset_id)
     if n_episodes != metadata["total_episodes"]:
         raise DatasetError(f"{source}: total_episodes is {metadata['total_episodes']}; there are {n_episodes} episodes.")
     return metadata
+
+
+def _check_fields(metadata: dict[str, Any], source: str) -> None:
+    for name, (kind, needed) in FIELDS.items():
+        value = metadata.get(name)
+        if type(value) not in kind and (needed or value is not None):
+            expected = " or ".join(one.__name__ for one in kind)
+            raise DatasetError(f"{source}: {name} is {reprlib.repr(value)}; expected is one of type {expected}.")
+        if isinstance(value, int | float) and not (math.isfinite(value) and (value >= 0 or name.startswith("ref"))):
+            raise DatasetError(f"{source}: {name} is {value}; a number is expected, and a count of at least 0.")
+    if metadata["data_format"] not in FORMATS:
+        found = f"data_format is {reprlib.repr(metadata['data_format'])}"
+        raise DatasetError(f"{source}: {found}; accepted are {', '.join(FORMATS)}.")
 
 
 def _n_entries(space: dict[str, Any]) -> int:
@@ -248,16 +252,20 @@ def _hdf5_reader(stack: contextlib.ExitStack, folder: Path, source: str) -> Call
     def episode(index: int) -> ReadArray:
         group = open_group(file, f"episode_{index}", source)
         where = f"{source}, episode {index}"
-        return lambda *path: read_hdf5(group, "/".join(f"_index_{key}" if isinstance(key, int) else key for key in path), where)
+        return lambda *path: read_hdf5(
+            group, "/".join(f"_index_{key}" if isinstance(key, int) else key for key in path), where
+        )
 
     return episode
 
 
 def _arrow_reader(data_format: str, folder: Path, source: str) -> Callable[[int], ReadArray]:
-    """Reads the Arrow or Parquet files of one episode, which Minari's storage takes for a single batch, whatever its length."""
+    """Reads the Arrow or Parquet files of an episode itself, since Minari's storage takes each for a single batch."""
 
     def episode(index: int) -> ReadArray:
-        files = pyarrow.dataset.dataset(folder / str(index), format=data_format, ignore_prefixes=["_", ".", METADATA_FILE_NAME])
+        files = pyarrow.dataset.dataset(
+            folder / str(index), format=data_format, ignore_prefixes=["_", ".", METADATA_FILE_NAME]
+        )
         missing = sorted(set(EPISODE_KEYS) - set(files.schema.names))
         if missing:
             raise DatasetError(f"{source}, episode {index}: holds no {', '.join(missing)}; the file is incomplete.")
@@ -303,7 +311,9 @@ def make_trajectory(read: ReadArray, observation_space: spaces.Space, name: str,
             f"{where}: holds {' and '.join(map(str, counts))} observations for {n_steps} rewards; "
             f"{n_steps + 1} or {n_steps} are accepted."
         )
-    terminations, truncations = (check_flags(read(key), n_steps, f"{where}: {key}") for key in ("terminations", "truncations"))
+    terminations, truncations = (
+        check_flags(read(key), n_steps, f"{where}: {key}") for key in ("terminations", "truncations")
+    )
     return Trajectory(
         observations=np.concatenate(columns, axis=1)[:n_steps] if len(columns) > 1 else columns[0][:n_steps],
         actions=actions,
@@ -331,7 +341,9 @@ def _flatten_observations(read: ReadArray, path: tuple[str | int, ...], space: s
     check_real(values.dtype, f"{where}: {name}")
     size = math.prod(space.shape or ())
     if values.shape[1:] not in (space.shape, (size,)):
-        raise DatasetError(f"{where}: {name} have shape {values.shape}, expected (steps, {', '.join(map(str, space.shape))}).")
+        raise DatasetError(
+            f"{where}: {name} have shape {values.shape}, expected (steps, {', '.join(map(str, space.shape or ()))})."
+        )
     if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
         return [np.stack([_one_hot(space, value, f"{where}: {name}") for value in values])]
     return [values.reshape(len(values), size)]

@@ -191,7 +191,7 @@ def _flags(arrays: _Arrays, names: Sequence[str], n_steps: int) -> np.ndarray:
 def _stops(arrays: _Arrays, n_steps: int, ended: np.ndarray) -> np.ndarray:
     """Steps of the file at which each episode has ended, (E,) int64, ascending, the last one N."""
     told = [_told_stops(arrays, name, n_steps) for name in (ENDS, LENGTHS) if arrays.has((name,))]
-    if len(told) == 2 and not np.array_equal(*told):
+    if len(told) == 2 and not np.array_equal(told[0], told[1]):
         raise DatasetError(f"{arrays.source}: {ENDS} and {LENGTHS} tell of other episodes; one of them is enough.")
     if told:
         return told[0]
@@ -208,13 +208,17 @@ def _told_stops(arrays: _Arrays, name: str, n_steps: int) -> np.ndarray:
     with np.errstate(invalid="ignore"):
         numbers = array.reshape(-1).astype(np.int64)
     if array.shape[:1] != (array.size,) or not (numbers == array.reshape(-1)).all():
-        raise DatasetError(f"{arrays.source}: {name} holds {array.dtype} of shape {array.shape}; whole numbers (E,) are expected.")
+        raise DatasetError(
+            f"{arrays.source}: {name} holds {array.dtype} of shape {array.shape}; whole numbers (E,) are expected."
+        )
     lengths = np.diff(numbers, prepend=0) if name == ENDS else numbers
     unfit = (lengths <= 0) | (lengths > n_steps)
     if unfit.any() or lengths.sum() != n_steps:
         first = np.flatnonzero(unfit)[:1]
         found = f"{lengths[first[0]]} steps in episode {first[0]}" if len(first) else f"{lengths.sum()} steps in all"
-        raise DatasetError(f"{arrays.source}: {name} tells of {found}; actions have {n_steps}, and each episode has at least one.")
+        raise DatasetError(
+            f"{arrays.source}: {name} tells of {found}; actions have {n_steps}, and each episode has at least one."
+        )
     return np.cumsum(lengths)
 
 

@@ -62,7 +62,9 @@ def check_size(n_bytes: int, n_stored: int, where: str) -> None:
     :raises DatasetError: it does
     """
     if n_bytes > SMALL_ARRAY + LARGEST_EXPANSION * n_stored:
-        raise DatasetError(f"{where} claim {n_bytes} bytes, of which {n_stored} are stored; the file is damaged or incomplete.")
+        raise DatasetError(
+            f"{where} claim {n_bytes} bytes, of which {n_stored} are stored; the file is damaged or incomplete."
+        )
 
 
 def check_flags(flags: np.ndarray, n_steps: int, where: str) -> np.ndarray:

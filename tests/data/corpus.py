@@ -223,8 +223,12 @@ HDF5: dict[str, tuple[Callable[[h5py.File, str, Path], object], str | None]] = {
     "compressed": (recreate(compression="gzip", chunks=True), SAME),
     "in chunks": (recreate(chunks=True), SAME),
     "with checksums": (recreate(fletcher32=True, chunks=True), SAME),
-    "references": (lambda file, path, folder: replace(
-        file, path, lambda array: file.create_dataset(path, data=[file.ref] * len(array), dtype=h5py.ref_dtype)), None),
+    "references": (
+        lambda file, path, folder: replace(
+            file, path, lambda array: file.create_dataset(path, data=[file.ref] * len(array), dtype=h5py.ref_dtype)
+        ),
+        None,
+    ),
     "objects": (put(lambda folder, array: np.array(["a"] * len(array), h5py.string_dtype())), None),
 }
 
@@ -408,7 +412,9 @@ def npz_cases() -> Iterator[Case]:
     for name, content in members.items():
         yield Case(f"npz, member: {name}", "npz", npz_member("rewards.npy", content), "set.npz", ("set.npz", "rewards"))
     bomb = header(f"({2**20}, 8)") + bytes(2**26)
-    yield Case("npz: bomb", "npz", npz_member("observations.npy", bomb, compressed=True), "set.npz", ("set.npz", "observations"))
+    yield Case(
+        "npz: bomb", "npz", npz_member("observations.npy", bomb, compressed=True), "set.npz", ("set.npz", "observations")
+    )
 
 
 # ------------------------------------------------------------------------------------------------------ files, metadata
@@ -454,7 +460,10 @@ def file_cases() -> Iterator[Case]:
     for kind, file in places.items():
         is_path = kind in ("npz", "robomimic")
         words = (Path(file).name,) if kind in ("npz", "robomimic", "hdf5") else ("episode 1",)
-        for name, make in {"is a folder": to_folder(file), "is missing": lambda folder, file=file: (folder / file).unlink()}.items():
+        for name, make in {
+            "is a folder": to_folder(file),
+            "is missing": lambda folder, file=file: (folder / file).unlink(),
+        }.items():
             yield Case(f"{kind}: {name}", kind, make, str(file) if is_path else MINARI_ID, words)
 
 
@@ -468,9 +477,16 @@ def metadata_change(**changes: Any) -> Callable[[Path], object]:
 
 
 MISSING = object()
-NO_STRINGS: dict[str, Any] = {"missing": MISSING, "null": None, "a number": 3, "a list": ["Box"], "an object": {}, "true": True}
-NO_COUNTS: dict[str, Any] = {"missing": MISSING, "null": None, "a word": "3", "a fraction": 3.5, "negative": -1, "true": True,
-                             "NaN": math.nan, "infinite": math.inf, "huge": SPARSE, "too large for 64 bits": 2**70,
+NO_STRINGS: dict[str, Any] = {
+    "missing": MISSING,
+    "null": None,
+    "a number": 3,
+    "a list": ["Box"],
+    "an object": {},
+    "true": True,
+}
+NO_COUNTS: dict[str, Any] = {"missing": MISSING, "null": None, "a word": "3", "a fraction": 3.5, "negative": -1,
+                             "true": True, "NaN": math.nan, "infinite": math.inf, "huge": SPARSE, "beyond 64 bits": 2**70,
                              "one more": "+1", "one less": "-1", "none": 0, "a list": [3]}  # fmt: skip
 NO_SPACES: dict[str, Any] = {
     "empty": "",
@@ -508,7 +524,8 @@ NO_SPECS: dict[str, Any] = {"empty": "", "a word": "Hopper", "a list": "[]", "nu
                             "a number for an id": '{"id": 3, "entry_point": "a:b", "additional_wrappers": []}'}  # fmt: skip
 NO_SCORES: dict[str, Any] = {"a word": "best", "a list": [1], "NaN": math.nan, "infinite": math.inf, "true": True}
 NO_METADATA: dict[str, bytes] = {
-    "empty": b"", "no JSON": b"{", "a list": b"[]", "a number": b"3", "null": b"null", "a word": b'"a"', "an empty object": b"{}",
+    "empty": b"", "no JSON": b"{", "a list": b"[]", "a number": b"3", "null": b"null", "a word": b'"a"',
+    "an empty object": b"{}",
     "bytes": bytes(range(256)), "nested deeply": b"[" * 100_000, "many digits": b'{"total_steps": ' + b"9" * 10_000 + b"}",
     "UTF-16": '{"a": 1}'.encode("utf-16"),
 }  # fmt: skip
@@ -516,7 +533,11 @@ NO_METADATA: dict[str, bytes] = {
 
 def metadata_cases() -> Iterator[Case]:
     def case(name: str, value: Any, field: str, outcome: str | tuple[str, ...] = ()) -> Case:
-        words = outcome if isinstance(outcome, str) else ("metadata.json|main_data", "steps" if field == "total_steps" else field, *outcome)
+        words = (
+            outcome
+            if isinstance(outcome, str)
+            else ("metadata.json|main_data", "steps" if field == "total_steps" else field, *outcome)
+        )
         return Case(f"metadata, {field}: {name}", "hdf5", metadata_change(**{field: value}), MINARI_ID, words)
 
     for field in ("dataset_id", "minari_version", "data_format", "observation_space", "action_space"):
@@ -526,7 +547,13 @@ def metadata_cases() -> Iterator[Case]:
             yield case(name, right + int(value) if value in ("+1", "-1") else value, field)
     for field, (name, space) in itertools.product(("observation_space", "action_space"), NO_SPACES.items()):
         text = space if isinstance(space, str) else json.dumps(space)
-        yield Case(f"{field}: {name}", "hdf5", metadata_change(**{field: text}), MINARI_ID, (field.replace("_", ".") + "|Observation space",))
+        yield Case(
+            f"{field}: {name}",
+            "hdf5",
+            metadata_change(**{field: text}),
+            MINARI_ID,
+            (field.replace("_", ".") + "|Observation space",),
+        )
     for field, (name, value) in itertools.product(("env_spec", "eval_env_spec"), NO_SPECS.items()):
         change = metadata_change(**{field: value})
         words = ("metadata.json", "env_spec|EnvSpec|additional_wrappers")
@@ -534,8 +561,12 @@ def metadata_cases() -> Iterator[Case]:
     for field, (name, value) in itertools.product(("ref_min_score", "ref_max_score"), NO_SCORES.items()):
         yield case(name, value, field)
     yield case("unknown", "sqlite", "data_format")
-    yield Case("data_format: other", "hdf5", metadata_change(data_format="arrow"), MINARI_ID, ("metadata.json", "0 episodes"))
-    yield Case("minari_version: unknown", "hdf5", metadata_change(minari_version="99.0"), MINARI_ID, ("metadata.json", "99.0"))
+    yield Case(
+        "data_format: other", "hdf5", metadata_change(data_format="arrow"), MINARI_ID, ("metadata.json", "0 episodes")
+    )
+    yield Case(
+        "minari_version: unknown", "hdf5", metadata_change(minari_version="99.0"), MINARI_ID, ("metadata.json", "99.0")
+    )
     yield case("a path", "../../etc", "dataset_id", SAME)
     yield case("null", None, "env_spec", SAME)
     yield Case("author: a number", "hdf5", metadata_change(author=3), MINARI_ID, ("metadata.json",))
@@ -615,12 +646,26 @@ def arrow_cases() -> Iterator[Case]:
         for name, (change, words) in tables.items():
             yield Case(f"{kind}: {name}", kind, arrow_change(kind, change), MINARI_ID, words)
         folder = DATA_FOLDER / "1"
-        yield Case(f"{kind}: no folder", kind, lambda root, folder=folder: shutil.rmtree(root / folder), MINARI_ID, ("total_episodes",))
-        yield Case(f"{kind}: one folder more", kind, lambda root: (root / DATA_FOLDER / "3").mkdir(), MINARI_ID, ("total_episodes",))
-        yield Case(f"{kind}: its own metadata are no JSON", kind, whole_file(lambda _: b"{", folder / "metadata.json"), MINARI_ID, SAME)
+        yield Case(
+            f"{kind}: no folder",
+            kind,
+            lambda root, folder=folder: shutil.rmtree(root / folder),
+            MINARI_ID,
+            ("total_episodes",),
+        )
+        yield Case(
+            f"{kind}: one folder more", kind, lambda root: (root / DATA_FOLDER / "3").mkdir(), MINARI_ID, ("total_episodes",)
+        )
+        yield Case(
+            f"{kind}: its own metadata are no JSON",
+            kind,
+            whole_file(lambda _: b"{", folder / "metadata.json"),
+            MINARI_ID,
+            SAME,
+        )
 
 
-def group_cases() -> Iterator[Case]:
+def group_cases() -> Iterator[Case]:  # noqa: C901 (a list)
     """Episodes as a whole, and what files say of themselves."""
     minari_file, robomimic_file = DATA_FOLDER / "main_data.hdf5", Path("set.hdf5")
 
@@ -652,10 +697,11 @@ def group_cases() -> Iterator[Case]:
         yield case(kind, "an episode in another file", path, away, name, path[-6:])
         yield case(kind, "an episode that links into nothing", path, link(h5py.SoftLink("/nowhere")), name, path[-6:])
         yield case(kind, "an episode that links to itself", path, link_to_itself, name, path[-6:])
-        yield case(kind, "an episode that links to the whole", path, link(h5py.SoftLink("/")), name, path[-6:].replace("_", "."))
+        yield case(
+            kind, "an episode that links to the whole", path, link(h5py.SoftLink("/")), name, path[-6:].replace("_", ".")
+        )
         yield case(kind, "an array for an episode", path, link(np.zeros(3)), name, path[-6:])
-        yield case(kind, "an episode elsewhere", path, lambda f, p, folder: (f.move(p, "/x"), f.__setitem__(p, h5py.SoftLink("/x"))),
-                   "total_episodes" if kind == "none" else SAME)  # fmt: skip
+        yield case(kind, "an episode elsewhere", path, linked, SAME)
     yield case("hdf5", "an episode more", "episode_1", lambda f, p, folder: f.copy(p, "episode_3"), "total_episodes", "4")
     yield case("hdf5", "an episode less", "episode_2", lambda f, p, folder: f.__delitem__(p), "total_episodes", "2")
     yield case("hdf5", "an episode of another number", "episode_1", move("/episode_7"), "main_data", "episode_1")
@@ -665,21 +711,40 @@ def group_cases() -> Iterator[Case]:
     yield case("robomimic", "no data", "data", lambda f, p, folder: f.__delitem__(p), "set.hdf5", "data")
     yield case("robomimic", "an array for data", "data", link(np.zeros(3)), "set.hdf5", "data")
     yield case("robomimic", "data in another file", "data", away, "set.hdf5", "data")
-    yield case("robomimic", "a demonstration less", "data/demo_2", lambda f, p, folder: f.__delitem__(p), "set.hdf5", "total")
+    yield case(
+        "robomimic", "a demonstration less", "data/demo_2", lambda f, p, folder: f.__delitem__(p), "set.hdf5", "total"
+    )
     yield case("robomimic", "no observations", "data/demo_1/obs", lambda f, p, folder: f.__delitem__(p), "demo_1", "obs")
     yield case("robomimic", "observations in another file", "data/demo_1/obs", away, "demo_1", "obs")
     for value in (3, -1, "many", [5, 5], 6.5, SPARSE):
         yield case("robomimic", f"total of {value}", "data", attribute("total", value), "set.hdf5", "total")
-        yield case("robomimic", f"num_samples of {value}", "data/demo_1", attribute("num_samples", value), "demo_1", "num_samples")
+        yield case(
+            "robomimic", f"num_samples of {value}", "data/demo_1", attribute("num_samples", value), "demo_1", "num_samples"
+        )
     env_args = ["", "{", "\\xff", b"\xff\xfe", "9" * 10_000, "[" * 100_000, np.zeros(3)]
     for number, value in enumerate(env_args):
-        yield case("robomimic", f"env_args that are no JSON, {number}", "data", attribute("env_args", value), "set.hdf5", "env_args")
-    odd: list[Any] = [{"type": []}, {"env_name": {}}, {"env_kwargs": []}, {"env_kwargs": 3}, {"env_kwargs": {"controller_configs": 3}},
-                      {"env_kwargs": {"controller_configs": [3]}}, {"env_kwargs": {"controller_configs": {"body_parts": 3}}},
-                      {"env_kwargs": {"controller_configs": {"input_min": "a"}}}, {"env_kwargs": {"controller_configs": {"input_max": [1, 2, 3]}}},
-                      {"env_kwargs": {"controller_configs": {"input_max": math.nan}}}]  # fmt: skip
+        yield case(
+            "robomimic", f"env_args that are no JSON, {number}", "data", attribute("env_args", value), "set.hdf5", "env_args"
+        )
+    controllers: list[Any] = [
+        3,
+        [3],
+        {"body_parts": 3},
+        {"input_min": "a"},
+        {"input_max": [1, 2, 3]},
+        {"input_max": math.nan},
+    ]
+    odd = [{"type": []}, {"env_name": {}}, {"env_kwargs": []}, {"env_kwargs": 3}]
+    odd += [{"env_kwargs": {"controller_configs": controller}} for controller in controllers]
     for number, value in enumerate(odd):
-        yield case("robomimic", f"odd env_args, {number}", "data", attribute("env_args", json.dumps(value)), "set.hdf5", "env_args|action space")
+        yield case(
+            "robomimic",
+            f"odd env_args, {number}",
+            "data",
+            attribute("env_args", json.dumps(value)),
+            "set.hdf5",
+            "env_args|action space",
+        )
     for number, value in enumerate(("[]", "3", "null", '"a"')):
         yield case("robomimic", f"env_args that say nothing, {number}", "data", attribute("env_args", value), SAME)
     over = of_array(lambda array: np.full(len(array), 3e38))

@@ -70,9 +70,12 @@ def test_a_bad_dataset_is_read_right_or_refused_with_file_episode_and_field(
         assert buffer.episode_lengths.tolist() == right.episode_lengths.tolist()
 
 
-DROPPED = ["npz, rewards: nan", *(f"{kind}, {what}" for kind in ("hdf5", "robomimic") for what in
-           ("rewards: nan", "actions: complex", "actions: claimed", "rewards: link to itself")),
-           "hdf5: overflowing return", "robomimic: an episode in another file", "arrow, rewards: nan", "parquet: no row"]  # fmt: skip
+ONE_ARRAY = ("rewards: nan", "actions: complex", "actions: claimed", "rewards: link to itself")
+DROPPED = [
+    *(f"{kind}, {what}" for kind in ("hdf5", "robomimic") for what in ONE_ARRAY),
+    *("npz, rewards: nan", "arrow, rewards: nan", "parquet: no row"),
+    *("hdf5: overflowing return", "robomimic: an episode in another file"),
+]
 
 
 @pytest.mark.parametrize("name", DROPPED)
@@ -96,7 +99,9 @@ def test_where_every_episode_is_invalid_none_is_left_to_learn_from(good: Path, t
     [case] = [case for case in CASES if case.name == "npz: overflowing return"]
     folder = shutil.copytree(good / "npz", tmp_path / "copy")
     case.change(folder)
-    with pytest.raises(DatasetError, match=r"no episode that could be kept of 3 \(the first: .*episode 0, step 0: returns-to-go"):
+    with pytest.raises(
+        DatasetError, match=r"no episode that could be kept of 3 \(the first: .*episode 0, step 0: returns-to-go"
+    ):
         load(folder, "set.npz", on_invalid="drop")
 
 
@@ -108,7 +113,9 @@ def test_on_invalid_is_one_of_two(good: Path):
 def test_nothing_named_in_the_metadata_is_run(good: Path, tmp_path: Path):
     """Minari builds the environment of `env_spec` where a space is missing."""
     mark = tmp_path / "mark"
-    spec = f'{{"id": "A-v0", "entry_point": "os:system", "kwargs": {{"command": "touch {mark}"}}, "additional_wrappers": []}}'
+    spec = (
+        f'{{"id": "A-v0", "entry_point": "os:system", "kwargs": {{"command": "touch {mark}"}}, "additional_wrappers": []}}'
+    )
     for number, missing in enumerate(((), ("observation_space",), ("action_space",), ("observation_space", "action_space"))):
         folder = shutil.copytree(good / "hdf5", tmp_path / str(number))
         corpus.metadata_change(env_spec=spec, **dict.fromkeys(missing, corpus.MISSING))(folder)
