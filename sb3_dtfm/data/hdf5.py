@@ -1,5 +1,6 @@
 """Arrays in hdf5 files that nobody vouches for: checked before a byte of them is read."""
 
+import contextlib
 import math
 
 import h5py
@@ -19,17 +20,17 @@ def read_hdf5(group: h5py.Group, name: str, where: str) -> np.ndarray:
     :param where: the file and the episode, for messages
     :raises DatasetError: there is none, it holds no numbers, lies in another file, or is not there in full
     """
-    data, shape = open_hdf5(group, name, where)
+    data, shape, dtype = open_hdf5(group, name, where)
     with naming(f"{where}: {name}"):
-        values = np.empty(shape, data.dtype)
+        values = np.empty(shape, dtype)
         if values.size > 0:
             data.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
         return values
 
 
-def open_hdf5(group: h5py.Group, name: str, where: str) -> tuple[h5py.h5d.DatasetID, tuple[int, ...]]:
+def open_hdf5(group: h5py.Group, name: str, where: str) -> tuple[h5py.h5d.DatasetID, tuple[int, ...], np.dtype]:
     """
-    An array that may be read, and its shape.
+    An array that may be read, its shape and its type.
 
     :param group: as for :func:`read_hdf5`, which says the rest too
     """
@@ -46,17 +47,19 @@ def open_hdf5(group: h5py.Group, name: str, where: str) -> tuple[h5py.h5d.Datase
         raise DatasetError(f"{what} have shape {shape}; one entry for each step is expected.")
     if not in_file:  # what is there can change without a trace, or be what nobody meant to give away
         raise DatasetError(f"{what} lie in another file; one file that holds everything is accepted.")
-    n_bytes = int(math.prod(shape)) * dtype.itemsize
+    n_bytes = math.prod(shape) * dtype.itemsize
     if n_bytes and not n_stored:
         raise DatasetError(f"{what} have shape {shape}, of which nothing has been written; the file is incomplete.")
     check_size(n_bytes, n_stored, what)
-    return data, shape
+    return data, shape, dtype
 
 
 def _stored_within(data: h5py.h5d.DatasetID) -> bool:
     """Whether the numbers lie in the file that describes them."""
-    if data.get_offset() is not None:  # the usual case, told at once
+    if data.get_offset() is not None:
         return True
+    with contextlib.suppress(TypeError, ValueError, RuntimeError):  # chunks always do, and a look at one takes no time
+        return data.get_chunk_info(0) is not None
     layout = data.get_create_plist()
     return layout.get_layout() != h5py.h5d.VIRTUAL and layout.get_external_count() == 0
 

@@ -186,7 +186,7 @@ def _check_count(group: h5py.Group, name: str, n_steps: int, where: str) -> None
 
 
 def _labels(demo: h5py.Group, where: str) -> _Labels:
-    _, shape = open_hdf5(demo, "actions", where)
+    _, shape, _ = open_hdf5(demo, "actions", where)
     if len(shape) != 2 or 0 in shape:
         raise DatasetError(f"{where}: actions have shape {shape}, expected (steps, dimensions) of at least one step.")
     n_steps, n_actions = shape
