@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import minari
 import numpy as np
 import torch as th
 
 import sb3_dtfm
 from sb3_dtfm.data import load_dataset
-from sb3_dtfm.data.minari import is_minari
+from sb3_dtfm.data.minari import is_minari, open_minari
 
 PACKAGES = ("sb3-dtfm", "torch", "stable-baselines3", "rl_zoo3", "gymnasium", "mujoco", "robosuite", "numpy")
 GIT_TIMEOUT = 20  # seconds
@@ -104,7 +103,7 @@ def _not_named(dataset: str) -> str:
 
 
 def _minari_source(dataset_id: str) -> str:
-    stored = minari.load_dataset(dataset_id).storage.metadata
+    stored = open_minari(dataset_id).storage.metadata
     return ": ".join(str(stored[key]) for key in ("algorithm_name", "description") if stored.get(key)) or "not named"
 
 

@@ -2,7 +2,8 @@
 
 import copy
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 import torch as th
@@ -16,13 +17,15 @@ from sb3_dtfm.data.trajectories import (
     ScoreReference,
     Trajectory,
     check_action_space,
+    check_size,
     check_trajectory,
-    returns_to_go,
 )
 from sb3_dtfm.windows import Windows
 
 # A buffer moves to an accelerator if it takes at most this share of the memory that is free there.
 DEVICE_MEMORY_SHARE = 0.5
+# What may become of an episode that is refused.
+ON_INVALID = ("raise", "drop")
 
 
 class TrajectoryBuffer:
@@ -39,6 +42,7 @@ class TrajectoryBuffer:
     :ivar returns_to_go: (N,) float32, environment reward units
     :ivar episodes: the buffer's episodes, one row each
     :ivar env_id: Gymnasium id of the environment that they come from, None where nobody says
+    :ivar dropped: how many episodes `on_invalid="drop"` has left out, and why the first of them; None where it had none
     :ivar device: what batches are made for
     """
 
@@ -52,6 +56,7 @@ class TrajectoryBuffer:
         score_reference: ScoreReference | None = None,
         env_id: str | None = None,
         maps: Sequence[MappedSteps] = (),
+        dropped: tuple[int, str] | None = None,
     ) -> None:
         self.observations = tensors["observations"]
         self.actions = tensors["actions"]
@@ -62,9 +67,16 @@ class TrajectoryBuffer:
         self.source = source
         self.score_reference = score_reference
         self.env_id = env_id
+        self.dropped = dropped
         self._maps = maps
         self.device = self.observations.device
         self._set_episodes(episodes)
+        if dropped:
+            n_all = dropped[0] + len(episodes.lengths)
+            warnings.warn(
+                f"{source}: {dropped[0]} of {n_all} episodes have been dropped, the first for this: {dropped[1]}",
+                stacklevel=2,
+            )
 
     def _set_episodes(self, episodes: EpisodeTable) -> None:
         self.episodes = episodes
@@ -86,11 +98,14 @@ class TrajectoryBuffer:
         score_reference: ScoreReference | None = None,
         env_id: str | None = None,
         storage: MemoryStorage | FileStorage | None = None,
+        on_invalid: str = "raise",
+        n_stored: int | None = None,
     ) -> "TrajectoryBuffer":
         """
         Copy episodes into flat arrays, checking every number on the way.
 
-        :param trajectories: the episodes, at least one, each of at least one step; an iterator is read once
+        :param trajectories: the episodes, at least one, each of at least one step; an iterator is read once, and may raise
+            DatasetError for an episode and go on with the next, as `map` does
         :param action_space: bounded Box of floats of shape (A,)
         :param observation_space: Box of shape (O,); unbounded with the first episode's O if not given
         :param n_steps: steps of all episodes, where known beforehand, so that memory for them is taken once
@@ -98,21 +113,34 @@ class TrajectoryBuffer:
         :param score_reference: scale of the normalised score
         :param env_id: Gymnasium id of the environment that the episodes come from
         :param storage: where the steps go, memory if not given
+        :param on_invalid: "raise" for an episode that is refused, or "drop" it, which is counted and warned of
+        :param n_stored: bytes of the files that the episodes are read from; episodes that take far more are refused before
+            they fill the memory, see :func:`~sb3_dtfm.data.trajectories.check_size`
         :raises DatasetError: nothing to learn from, other spaces, wrong shapes, NaN or infinity, or actions outside of
             `action_space`
         """
+        if on_invalid not in ON_INVALID:
+            raise DatasetError(f"on_invalid must be one of {', '.join(ON_INVALID)}, got {on_invalid!r}.")
         action_space = check_action_space(action_space, source)
         storage = storage or MemoryStorage()
         if n_steps is None and isinstance(trajectories, Sequence):
             n_steps = sum(map(len, trajectories))
         storage.reserve(n_steps or 0)
         rows: list[tuple] = []
+        dropped: list[DatasetError] = []
         start = 0
-        for trajectory in trajectories:
-            if observation_space is None:
-                observation_space = spaces.Box(-np.inf, np.inf, np.shape(trajectory.observations)[1:], np.float32)
-            check_trajectory(trajectory, observation_space, action_space, source)
-            to_go = returns_to_go(trajectory.rewards)
+
+        def check(trajectory: Trajectory) -> np.ndarray:
+            nonlocal observation_space
+            space = observation_space or spaces.Box(-np.inf, np.inf, np.shape(trajectory.observations)[1:], np.float32)
+            to_go = check_trajectory(trajectory, space, action_space, source)
+            if n_stored is not None:
+                n_rows, n_columns = max(n_steps or 0, start + len(trajectory)), space.shape[0] + action_space.shape[0] + 2
+                check_size(4 * n_rows * n_columns, n_stored, f"{source}: {n_rows} steps")
+            observation_space = space
+            return to_go
+
+        for trajectory, to_go in _checked(trajectories, check, dropped, on_invalid):
             storage.append(
                 {
                     "observations": trajectory.observations,
@@ -124,7 +152,8 @@ class TrajectoryBuffer:
             rows.append(_episode_row(trajectory, start, to_go))
             start += len(trajectory)
         if observation_space is None or not rows:
-            raise DatasetError(f"{source}: holds no episode; at least one is needed.")
+            left = f" that could be kept of {len(dropped)} (the first: {dropped[0]})" if dropped else ""
+            raise DatasetError(f"{source}: holds no episode{left}; at least one is needed.")
         return cls(
             storage.finish(),
             EpisodeTable(*(np.array(column) for column in zip(*rows, strict=True))),
@@ -133,6 +162,7 @@ class TrajectoryBuffer:
             source,
             score_reference,
             env_id,
+            dropped=(len(dropped), str(dropped[0])) if dropped else None,
         )
 
     def __repr__(self) -> str:
@@ -150,6 +180,11 @@ class TrajectoryBuffer:
     @property
     def n_episodes(self) -> int:
         return len(self.episodes.lengths)
+
+    @property
+    def n_dropped(self) -> int:
+        """How many episodes `on_invalid="drop"` has left out."""
+        return self.dropped[0] if self.dropped else 0
 
     @property
     def episode_lengths(self) -> np.ndarray:
@@ -377,6 +412,32 @@ class TrajectoryBuffer:
         episodes = th.searchsorted(self._stops, positions, right=True)
         timesteps = positions - self._firsts[episodes]
         return self._starts[episodes] + timesteps, timesteps, self._stops[episodes] - 1 - positions
+
+
+def _checked(
+    trajectories: Iterable[Trajectory],
+    check: Callable[[Trajectory], np.ndarray],
+    dropped: list[DatasetError],
+    on_invalid: str,
+) -> Iterator[tuple[Trajectory, np.ndarray]]:
+    """
+    Episodes that pass a check, each with what the check made of it.
+
+    :param dropped: gets the reason for each other one, where `on_invalid` is "drop"
+    """
+    iterator = iter(trajectories)
+    while True:
+        try:
+            trajectory = next(iterator)
+            checked = check(trajectory)
+        except StopIteration:
+            return
+        except DatasetError as error:
+            if on_invalid == "raise":
+                raise
+            dropped.append(error)
+        else:
+            yield trajectory, checked
 
 
 def _episode_row(trajectory: Trajectory, start: int, to_go: np.ndarray) -> tuple:

@@ -1,11 +1,13 @@
 """Datasets as folders of flat float32 arrays that are memory-mapped: built once, opened at once, larger than memory."""
 
+import concurrent.futures
 import contextlib
 import hashlib
 import json
 import os
 import re
 import shutil
+import threading
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -18,14 +20,16 @@ from gymnasium import spaces
 
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.episodes import EpisodeTable
-from sb3_dtfm.data.storage import STEP_ARRAYS, FileStorage, MappedSteps
+from sb3_dtfm.data.storage import STEP_ARRAYS, WRITE_BUFFER, FileStorage, MappedSteps
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference
 
 # Counts up whenever what is stored, or what the readers make of a dataset, changes: older caches are then built anew.
-FORMAT = 2
+FORMAT = 3
 DESCRIPTION = "cache.json"
 EPISODES = "episodes.npz"
 BOXES = ("observation_space", "action_space")
+# Files of more bytes than this are checked in the background; reading takes about a second for 2**30.
+LARGE = 2**26
 # What numpy raises for a file that is missing, empty, cut off, or of another kind.
 READ_ERRORS = (OSError, EOFError, LookupError, TypeError, ValueError, zipfile.BadZipFile)
 
@@ -91,7 +95,8 @@ def load_cached(
     """
     Open a dataset's cache, which is built first if there is none or the dataset has changed since.
 
-    Other processes wait while one builds. A build that does not come to its end leaves no cache.
+    Other processes wait while one builds. A build that does not come to its end leaves no cache, and the next one removes
+    what it leaves.
 
     :param cache_dir: folder of caches, made if necessary
     :param fingerprint: of the dataset as it is now
@@ -100,10 +105,11 @@ def load_cached(
     """
     folder = cache_dir / fingerprint.folder_name
     try:
-        cache_dir.mkdir(parents=True, exist_ok=True)
-        with FileLock(cache_dir / f".{folder.name}.lock"):
-            if not _is_current(folder, fingerprint):
-                _build(folder, fingerprint, read)
+        if not _is_current(folder, fingerprint):  # one that is needs no lock, which a read-only folder could not hold
+            cache_dir.mkdir(parents=True, exist_ok=True)
+            with FileLock(cache_dir / f".{folder.name}.lock"):
+                if not _is_current(folder, fingerprint):
+                    _build(folder, fingerprint, read)
     except OSError as error:
         raise DatasetError(f"cache {folder} of {fingerprint.name} cannot be written: {error}") from error
     return open_cache(folder)
@@ -117,10 +123,13 @@ def _is_current(folder: Path, fingerprint: Fingerprint) -> bool:
 
 
 def _build(folder: Path, fingerprint: Fingerprint, read: Callable[[FileStorage], TrajectoryBuffer]) -> None:
-    part = folder.with_name(f".{folder.name}.part")
-    for old in (part, folder):  # what a killed build left, and an outdated cache, whose room may be needed
-        if old.exists():
-            shutil.rmtree(old)
+    part, old = (folder.with_name(f".{folder.name}.{suffix}") for suffix in ("part", "old"))
+    for left in (part, old):  # by a build that was killed
+        if left.exists():
+            shutil.rmtree(left)
+    if folder.exists():  # outdated, and its room may be needed; half of it must never be found under its name
+        folder.rename(old)
+        shutil.rmtree(old)
     part.mkdir()
     try:
         with contextlib.closing(FileStorage(part, f"Caching {fingerprint.name}")) as storage:
@@ -133,8 +142,10 @@ def _build(folder: Path, fingerprint: Fingerprint, read: Callable[[FileStorage],
             "env_id": buffer.env_id,
             "score_reference": buffer.score_reference,
             "n_steps": len(buffer),
+            "dropped": buffer.dropped,
+            "digests": {file.name: _file_digest(file) for file in sorted(part.iterdir())},
         }
-        (part / DESCRIPTION).write_text(json.dumps(description, indent=2))
+        (part / DESCRIPTION).write_text(json.dumps({**description, "digest": _digest(description)}, indent=2))
         part.rename(folder)
     except BaseException:
         shutil.rmtree(part, ignore_errors=True)
@@ -174,6 +185,9 @@ def open_cache(folder: Path) -> TrajectoryBuffer:
     :raises DatasetError: the cache is damaged or incomplete
     """
     description = _read_description(folder)
+    if description.pop("digest", None) != _digest(description):
+        raise _damaged(folder, DESCRIPTION, "not as it was written")
+    check = _check_members(folder, description["digests"])
     try:
         with np.load(folder / EPISODES) as arrays:
             episodes = EpisodeTable(*(arrays[name] for name in EpisodeTable._fields))
@@ -184,6 +198,8 @@ def open_cache(folder: Path) -> TrajectoryBuffer:
     n_steps = int(description["n_steps"])
     reference = description["score_reference"]
     maps = {name: _checked_map(folder, name, (n_steps, *shapes.get(name, ()))) for name in STEP_ARRAYS}
+    for steps in maps.values():
+        steps.check = check
     return TrajectoryBuffer(
         {name: steps.tensor for name, steps in maps.items()},
         episodes,
@@ -193,7 +209,68 @@ def open_cache(folder: Path) -> TrajectoryBuffer:
         None if reference is None else ScoreReference(*reference),
         description["env_id"],
         maps=[steps for name, steps in maps.items() if name != "rewards"],  # which windows do not hold
+        dropped=description["dropped"],
     )
+
+
+def _file_digest(path: Path) -> str:
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while block := file.read(WRITE_BUFFER):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+# Files that this process has looked at: path, size, time of the last change, and digest.
+_checked: set[tuple[str, int, int, str]] = set()
+
+
+def _check_members(folder: Path, digests: dict[str, str]) -> concurrent.futures.Future[None] | None:
+    """
+    Compare files with what was written, once in a process: at once, or one after the other in the background if large.
+
+    :param digests: of each file, by its name
+    :return: what is still going on, and will hold the error if there is one
+    :raises DatasetError: a small file is missing or holds other bytes
+    """
+    large = []
+    for name, digest in digests.items():
+        try:
+            state = (folder / name).stat()
+        except OSError as error:
+            raise _damaged(folder, name, error) from error
+        key = (str((folder / name).absolute()), state.st_size, state.st_mtime_ns, digest)
+        if key in _checked:
+            continue
+        if state.st_size > LARGE:
+            large.append(key)
+        else:
+            _check_member(key)
+    if not large:
+        return None
+    future: concurrent.futures.Future[None] = concurrent.futures.Future()
+
+    def run() -> None:
+        try:
+            for key in large:
+                _check_member(key)
+            future.set_result(None)
+        except DatasetError as error:
+            future.set_exception(error)
+
+    threading.Thread(target=run, name="cache digests", daemon=True).start()  # a run that ends early does not wait
+    return future
+
+
+def _check_member(key: tuple[str, int, int, str]) -> None:
+    path, digest = Path(key[0]), key[-1]
+    try:
+        found = _file_digest(path)
+    except OSError as error:
+        raise _damaged(path.parent, path.name, error) from error
+    if found != digest:
+        raise _damaged(path.parent, path.name, "not as it was written")
+    _checked.add(key)
 
 
 def _checked_map(folder: Path, name: str, shape: tuple[int, ...]) -> MappedSteps:

@@ -1,28 +1,54 @@
 """Reading Minari datasets into a `TrajectoryBuffer`."""
 
+import contextlib
 import itertools
+import json
+import math
+import reprlib
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import h5py
 import minari
 import numpy as np
+import pyarrow.dataset
 from gymnasium import spaces
 from minari.dataset.minari_dataset import parse_dataset_id
+from minari.serialization import deserialize_space
 from minari.storage import get_dataset_path
 
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint
+from sb3_dtfm.data.hdf5 import open_group, read_hdf5
 from sb3_dtfm.data.storage import FileStorage
-from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory
+from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, check_flags, check_real, naming
 from sb3_dtfm.envs.return_to_go import flatten_observation_space, sort_observation_space
 
-HDF5_FILE_NAME = "main_data.hdf5"
+METADATA_FILE_NAME, HDF5_FILE_NAME = "metadata.json", "main_data.hdf5"
 # Bytes that HDF5 may keep of a file's structure; its own limit is a third of a usual dataset's size.
 STRUCTURE_CACHE = 2**20
 EPISODE_KEYS = ("observations", "actions", "rewards", "terminations", "truncations")
+# Fields of metadata.json: types that each may have, and whether every dataset has it.
+FIELDS: dict[str, tuple[tuple[type, ...], bool]] = {
+    "dataset_id": ((str,), True),
+    "minari_version": ((str,), True),
+    "data_format": ((str,), True),
+    "total_episodes": ((int,), True),
+    "total_steps": ((int,), True),
+    "observation_space": ((str,), True),
+    "action_space": ((str,), True),
+    "env_spec": ((str,), False),
+    "eval_env_spec": ((str,), False),
+    "ref_min_score": ((int, float), False),
+    "ref_max_score": ((int, float), False),
+}
+FORMATS = ("hdf5", "arrow", "parquet")
+# Entries of the vector that a step's observation, or action, becomes: no task has as many.
+MOST_ENTRIES = 2**20
+# Gives one of an episode's arrays by its name, followed by the keys of the parts of a Dict or Tuple that lead to it.
+ReadArray: TypeAlias = Callable[..., np.ndarray]
 
 
 def is_minari(dataset: Any) -> bool:
@@ -40,65 +66,84 @@ def fingerprint_minari(dataset: str | minari.MinariDataset, options: dict[str, A
     """
     Of a dataset as it is now, downloaded if necessary, and of its choice of episodes.
 
-    :param dataset: as for :func:`load_minari`, which has no options
+    :param dataset: as for :func:`load_minari`
+    :param options: of :func:`load_minari`
     """
     dataset = open_minari(dataset) if isinstance(dataset, str) else dataset
     episodes = dataset.episode_indices.tolist()
-    is_whole = episodes == list(range(dataset.storage.total_episodes))
-    return Fingerprint.of(dataset.id, Path(dataset.storage.data_path), "all" if is_whole else episodes)
+    arguments: Any = "all" if _is_whole(dataset) else episodes
+    return Fingerprint.of(dataset.id, Path(dataset.storage.data_path), [arguments, options] if options else arguments)
 
 
-def load_minari(dataset: str | minari.MinariDataset, storage: FileStorage | None = None) -> TrajectoryBuffer:
+def _is_whole(dataset: minari.MinariDataset) -> bool:
+    return bool(np.array_equal(dataset.episode_indices, np.arange(dataset.storage.total_episodes)))
+
+
+def load_minari(
+    dataset: str | minari.MinariDataset, on_invalid: str = "raise", storage: FileStorage | None = None
+) -> TrajectoryBuffer:
     """
     Read a Minari dataset: a local one, else one that Minari's own client downloads.
 
+    Nothing that its metadata name is imported, built or run: of `env_spec` only the id is read.
+
     :param dataset: id (`namespace/name-vN`) or an opened dataset, whose choice of episodes is kept
+    :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
     :param storage: where the steps go, memory if not given
     :return: its episodes, with the normalised-score scale of its metadata where it names one
-    :raises DatasetError: neither found nor downloaded, damaged, or not fit for learning (names the file and episode)
+    :raises DatasetError: neither found nor downloaded, damaged, or not fit for learning (names the file, episode and field)
     """
     if isinstance(dataset, str):
         dataset = open_minari(dataset)
-    hdf5_file = Path(dataset.storage.data_path) / HDF5_FILE_NAME
-    in_hdf5 = hdf5_file.exists()
-    source = f"Minari dataset {dataset.id} ({hdf5_file if in_hdf5 else hdf5_file.parent})"
+    folder = Path(dataset.storage.data_path)
+    in_hdf5 = dataset.storage.FORMAT == "hdf5"
+    source = f"Minari dataset {dataset.id} ({folder / HDF5_FILE_NAME if in_hdf5 else folder})"
+    metadata = read_metadata(folder, dataset.id)
     if len(dataset.episode_indices) == 0:
         raise DatasetError(f"{source}: holds no episode; at least one is needed.")
-    try:
-        observation_space = flatten_observation_space(dataset.observation_space)
-    except ValueError as error:
-        raise DatasetError(f"{source}: {error}") from error
-    try:
-        return TrajectoryBuffer.from_trajectories(
-            _read_hdf5(dataset, source, hdf5_file) if in_hdf5 else _read_storage(dataset, source),
+    with contextlib.ExitStack() as stack, naming(source):
+        env_spec = dataset.env_spec
+        observation_space = _flat(dataset.observation_space, source)
+        read = _hdf5_reader(stack, folder, source) if in_hdf5 else _arrow_reader(dataset.storage.FORMAT, folder, source)
+
+        def trajectory(index: int) -> Trajectory:
+            name = f"episode {index}"
+            with naming(f"{source}, {name}"):
+                return make_trajectory(read(index), dataset.observation_space, name, source)
+
+        buffer = TrajectoryBuffer.from_trajectories(
+            map(trajectory, dataset.episode_indices.tolist()),
             dataset.action_space,
             observation_space,
             n_steps=dataset.total_steps,
             source=source,
-            score_reference=score_reference(dataset),
-            env_id=dataset.env_spec.id if dataset.env_spec else None,
+            score_reference=_score_reference(metadata),
+            env_id=env_spec.id if env_spec else None,
             storage=storage,
+            on_invalid=on_invalid,
+            n_stored=sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()),
         )
-    except (OSError, LookupError, RuntimeError) as error:
-        raise DatasetError(f"{source}: the file is damaged or incomplete: {error}") from error
+        if len(buffer) != dataset.total_steps and not buffer.n_dropped:
+            found = f"total_steps tells of {dataset.total_steps} steps, and the episodes have {len(buffer)}"
+            raise DatasetError(f"{source}: {found}; the dataset is incomplete.")
+        return buffer
 
 
 def open_minari(dataset_id: str) -> minari.MinariDataset:
     """
-    Open a local dataset, or download it first.
+    Open a local dataset, or download it first. Its metadata are checked before Minari sees them.
 
     :param dataset_id: `namespace/name-vN`
     :raises DatasetError: malformed id, damaged local files, or neither found nor downloaded
     """
     if not is_minari(dataset_id):
         raise DatasetError(f"{dataset_id!r} is no Minari id; expected namespace/name-vN.")
-    data_path = get_dataset_path(dataset_id) / "data"
-    if not data_path.exists():
+    folder = get_dataset_path(dataset_id) / "data"
+    if not folder.exists():
         _download(dataset_id)
-    try:
+    read_metadata(folder, dataset_id)
+    with naming(f"Minari dataset {dataset_id} ({folder / METADATA_FILE_NAME})"):
         return minari.load_dataset(dataset_id)
-    except Exception as error:  # Minari checks its files with assert, KeyError and ValueError alike
-        raise DatasetError(f"Minari dataset {dataset_id} ({data_path}) is damaged or incomplete: {error!r}") from error
 
 
 def _download(dataset_id: str) -> None:
@@ -114,110 +159,197 @@ def _download(dataset_id: str) -> None:
         ) from error
 
 
-def score_reference(dataset: minari.MinariDataset) -> ScoreReference | None:
+def read_metadata(folder: Path, dataset_id: str) -> dict[str, Any]:
+    """
+    What a dataset says of itself, checked before anybody acts on it.
+
+    Minari takes memory for as many episodes and entries as are named, and where a space is missing it builds the
+    environment of `env_spec`: it then imports and calls whatever stands there.
+
+    :param folder: of the dataset's data
+    :param dataset_id: for messages
+    :raises DatasetError: names the field, what was found and what is accepted
+    """
+    path = folder / METADATA_FILE_NAME
+    source = f"Minari dataset {dataset_id} ({path})"
+    with naming(source):
+        metadata = json.loads(path.read_text())
+    if not isinstance(metadata, dict):
+        raise DatasetError(f"{source}: holds a {type(metadata).__name__}; a JSON object is expected.")
+    _check_fields(metadata, source)
+    for name in ("observation_space", "action_space"):
+        with naming(f"{source}: {name}"):
+            n_entries = _n_entries(json.loads(metadata[name]))
+            if not n_entries <= MOST_ENTRIES:
+                raise DatasetError(f"{source}: {name} has {n_entries} entries; up to {MOST_ENTRIES} are accepted.")
+            deserialize_space(metadata[name])
+    for name in ("env_spec", "eval_env_spec"):
+        with naming(f"{source}: {name}"):
+            if metadata.get(name) is not None and not isinstance(json.loads(metadata[name]), dict):
+                raise DatasetError(f"{source}: {name} is {reprlib.repr(metadata[name])}; a JSON object is expected.")
+    n_episodes = _n_episodes(folder, metadata["data_format"], dataset_id)
+    if n_episodes != metadata["total_episodes"]:
+        raise DatasetError(f"{source}: total_episodes is {metadata['total_episodes']}; there are {n_episodes} episodes.")
+    return metadata
+
+
+def _check_fields(metadata: dict[str, Any], source: str) -> None:
+    for name, (kind, needed) in FIELDS.items():
+        value = metadata.get(name)
+        if type(value) not in kind and (needed or value is not None):
+            expected = " or ".join(one.__name__ for one in kind)
+            raise DatasetError(f"{source}: {name} is {reprlib.repr(value)}; expected is one of type {expected}.")
+        if isinstance(value, int | float) and not (math.isfinite(value) and (value >= 0 or name.startswith("ref"))):
+            raise DatasetError(f"{source}: {name} is {value}; a number is expected, and a count of at least 0.")
+    if metadata["data_format"] not in FORMATS:
+        found = f"data_format is {reprlib.repr(metadata['data_format'])}"
+        raise DatasetError(f"{source}: {found}; accepted are {', '.join(FORMATS)}.")
+
+
+def _n_entries(space: dict[str, Any]) -> int:
+    """How many numbers a space's entries flatten to, before it is built."""
+    if space["type"] in ("Dict", "Tuple"):
+        parts = space["subspaces"]
+        return sum(map(_n_entries, parts.values() if isinstance(parts, dict) else parts))
+    size = space.get("shape", space.get("n", space.get("nvec", 0)))
+    return int(np.sum(size, dtype=object) if space["type"] == "MultiDiscrete" else math.prod(np.ravel(size).tolist()))
+
+
+def _n_episodes(folder: Path, data_format: str, dataset_id: str) -> int:
+    """How many episodes are there, whatever the metadata say."""
+    data = folder / HDF5_FILE_NAME if data_format == "hdf5" else folder
+    with naming(f"Minari dataset {dataset_id} ({data})"):
+        if data_format != "hdf5":
+            return sum(path.name.isdigit() for path in data.iterdir())
+        with h5py.File(data, "r") as file:
+            return sum(name.startswith("episode_") for name in file)
+
+
+def _flat(space: spaces.Space, source: str) -> spaces.Box:
+    try:
+        return flatten_observation_space(space)
+    except ValueError as error:
+        raise DatasetError(f"{source}: {error}") from error
+
+
+def _score_reference(metadata: dict[str, Any]) -> ScoreReference | None:
     """The scale of normalised scores that a dataset's metadata holds, if it holds one that can be used."""
-    metadata = dataset.storage.metadata
     minimum, maximum = metadata.get("ref_min_score"), metadata.get("ref_max_score")
     if minimum is None or maximum is None or not minimum < maximum:
         return None
-    scale = f"Minari's scale: ref_min_score and ref_max_score of {dataset.id}"
+    scale = f"Minari's scale: ref_min_score and ref_max_score of {metadata['dataset_id']}"
     return ScoreReference(float(minimum), float(maximum), scale)
 
 
-def _read_hdf5(dataset: minari.MinariDataset, source: str, path: Path) -> Iterator[Trajectory]:
+def _hdf5_reader(stack: contextlib.ExitStack, folder: Path, source: str) -> Callable[[int], ReadArray]:
     """Reads the HDF5 file itself, since Minari's storage decodes all infos with every episode."""
-    with h5py.File(path, "r") as file:
-        cache = file.id.get_mdc_config()
-        cache.set_initial_size = True
-        cache.initial_size = cache.min_size = cache.max_size = STRUCTURE_CACHE
-        file.id.set_mdc_config(cache)
-        for index in dataset.episode_indices:
-            try:
-                yield make_trajectory(file[f"episode_{index}"], dataset.observation_space, f"episode {index}", source)
-            except KeyError:
-                keys = set(file.get(f"episode_{index}", ()))
-                missing = [key for key in EPISODE_KEYS if key not in keys]
-                if not missing:
-                    raise
-                raise DatasetError(
-                    f"{source}, episode {index}: holds no {', '.join(missing)}; the file is incomplete."
-                ) from None
+    file = stack.enter_context(h5py.File(folder / HDF5_FILE_NAME, "r"))
+    cache = file.id.get_mdc_config()
+    cache.set_initial_size = True
+    cache.initial_size = cache.min_size = cache.max_size = STRUCTURE_CACHE
+    file.id.set_mdc_config(cache)
+
+    def episode(index: int) -> ReadArray:
+        group = open_group(file, f"episode_{index}", source)
+        where = f"{source}, episode {index}"
+        return lambda *path: read_hdf5(
+            group, "/".join(f"_index_{key}" if isinstance(key, int) else key for key in path), where
+        )
+
+    return episode
 
 
-def _read_storage(dataset: minari.MinariDataset, source: str) -> Iterator[Trajectory]:
-    """Reads through Minari's storage: Arrow and Parquet."""
-    episodes = dataset.storage.get_episodes(dataset.episode_indices)
-    for index, episode in zip(dataset.episode_indices, episodes, strict=True):
-        yield make_trajectory(episode, dataset.observation_space, f"episode {index}", source)
+def _arrow_reader(data_format: str, folder: Path, source: str) -> Callable[[int], ReadArray]:
+    """Reads the Arrow or Parquet files of an episode itself, since Minari's storage takes each for a single batch."""
+
+    def episode(index: int) -> ReadArray:
+        files = pyarrow.dataset.dataset(
+            folder / str(index), format=data_format, ignore_prefixes=["_", ".", METADATA_FILE_NAME]
+        )
+        missing = sorted(set(EPISODE_KEYS) - set(files.schema.names))
+        if missing:
+            raise DatasetError(f"{source}, episode {index}: holds no {', '.join(missing)}; the file is incomplete.")
+        table = files.to_table(columns=list(EPISODE_KEYS))
+        table.validate(full=True)
+
+        def array(name: str, *path: str | int) -> np.ndarray:
+            with naming(f"{source}, episode {index}: {name}"):
+                values = table[name].combine_chunks()
+                for key in path:
+                    values = values.field(str(key))
+                # Observations are one more than actions: the other columns are stored with an entry that nobody gave.
+                values = values if name == "observations" else values[:-1]
+                if not pyarrow.types.is_fixed_size_list(values.type):
+                    return values.to_numpy(zero_copy_only=False)
+                return values.flatten().to_numpy(zero_copy_only=False).reshape(len(values), -1)
+
+        return array
+
+    return episode
 
 
-def make_trajectory(episode: Mapping[str, Any], observation_space: spaces.Space, name: str, source: str) -> Trajectory:
+def make_trajectory(read: ReadArray, observation_space: spaces.Space, name: str, source: str) -> Trajectory:
     """
     One episode of a Minari file.
 
-    :param episode: HDF5 group or dict with observations, actions, rewards, terminations, truncations
+    :param read: gives an array of observations, actions, rewards, terminations, truncations; a part of a Dict or Tuple
+        by its keys
     :param observation_space: the dataset's own
     :param name: what the file calls the episode
     :param source: the file, for messages
-    :raises DatasetError: its arrays differ in length
-    :raises KeyError: one of them is missing
+    :raises DatasetError: one of its arrays is missing, or they differ in length
     """
-    rewards = np.asarray(read_array(episode, "rewards"), dtype=np.float64)
+    where = f"{source}, {name}"
+    rewards, actions = read("rewards"), read("actions")
     n_steps = len(rewards)
-    columns = flatten_observations(episode, "observations", sort_observation_space(observation_space))
+    if len(actions) != n_steps:
+        raise DatasetError(f"{where}: holds {len(actions)} actions for {n_steps} rewards; as many are expected.")
+    columns = _flatten_observations(read, ("observations",), sort_observation_space(observation_space), where)
     counts = sorted({len(column) for column in columns})
     if len(counts) != 1 or counts[0] - n_steps not in (0, 1):
         raise DatasetError(
-            f"{source}, {name}: holds {' and '.join(map(str, counts))} observations for {n_steps} rewards; "
+            f"{where}: holds {' and '.join(map(str, counts))} observations for {n_steps} rewards; "
             f"{n_steps + 1} or {n_steps} are accepted."
         )
+    terminations, truncations = (
+        check_flags(read(key), n_steps, f"{where}: {key}") for key in ("terminations", "truncations")
+    )
     return Trajectory(
         observations=np.concatenate(columns, axis=1)[:n_steps] if len(columns) > 1 else columns[0][:n_steps],
-        actions=read_array(episode, "actions"),
+        actions=actions,
         rewards=rewards,
-        terminated=bool(n_steps and read_array(episode, "terminations")[-1]),
-        truncated=bool(n_steps and read_array(episode, "truncations")[-1]),
+        terminated=bool(terminations[-1:].any()),
+        truncated=bool(truncations[-1:].any()),
         name=name,
     )
 
 
-def flatten_observations(parent: Any, key: str | int, space: spaces.Space) -> list[np.ndarray]:
+def _flatten_observations(read: ReadArray, path: tuple[str | int, ...], space: spaces.Space, where: str) -> list[np.ndarray]:
     """
     A whole episode's observations as columns of the vector that the wrapper makes of one observation.
 
-    :param parent: HDF5 group, dict or tuple that holds T + 1 (or T) entries
-    :param key: under this name, or in groups, dicts and tuples of that name for Dict and Tuple
+    :param read: see :func:`make_trajectory`
+    :param path: keys that lead to the part of the observations that `space` describes
     :param space: observation space with sorted keys
     :return: arrays (T + 1, .) to be joined along the second axis
     """
-    if isinstance(space, spaces.Dict):
-        columns = [flatten_observations(parent[key], name, part) for name, part in space.spaces.items()]
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        parts = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
+        columns = [_flatten_observations(read, (*path, key), part, where) for key, part in parts]
         return list(itertools.chain.from_iterable(columns))
-    if isinstance(space, spaces.Tuple):
-        data = parent[key]
-        names = [f"_index_{i}" if isinstance(data, h5py.Group) else i for i in range(len(space))]
-        columns = [flatten_observations(data, name, part) for name, part in zip(names, space.spaces, strict=True)]
-        return list(itertools.chain.from_iterable(columns))
-    values = read_array(parent, key)
+    values, name = read(*path), "/".join(map(str, path))
+    check_real(values.dtype, f"{where}: {name}")
+    size = math.prod(space.shape or ())
+    if values.shape[1:] not in (space.shape, (size,)):
+        raise DatasetError(
+            f"{where}: {name} have shape {values.shape}, expected (steps, {', '.join(map(str, space.shape or ()))})."
+        )
     if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
-        return [np.stack([np.asarray(spaces.flatten(space, value)) for value in values])]
-    return [values.reshape(len(values), -1)]
+        return [np.stack([_one_hot(space, value, f"{where}: {name}") for value in values])]
+    return [values.reshape(len(values), size)]
 
 
-def read_array(parent: Any, key: str | int) -> np.ndarray:
-    """
-    All values of an array.
-
-    Most of the time that `parent[key][:]` takes goes into h5py's objects, so HDF5 is asked directly.
-
-    :param parent: HDF5 group, dict or tuple
-    :param key: what the array is called there
-    :raises KeyError: nothing is called so
-    """
-    if not isinstance(parent, h5py.Group):
-        return np.asarray(parent[key])
-    data = h5py.h5d.open(parent.id, str(key).encode())
-    values = np.empty(data.shape, data.dtype)
-    if values.size > 0:
-        data.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
-    return values
+def _one_hot(space: spaces.Space, value: Any, where: str) -> np.ndarray:
+    if not space.contains(value):  # NumPy would count a negative one from the end
+        raise DatasetError(f"{where} hold {value}, which is not in {space}.")
+    return np.asarray(spaces.flatten(space, value))

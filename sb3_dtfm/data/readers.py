@@ -56,7 +56,9 @@ def load_dataset(
     :param cache_dir: learn from memory-mapped files in this folder, for datasets larger than memory; they are written at
         the first call and whenever the dataset has changed. None reads everything into memory
     :param env_id: Gymnasium id of the environment that the episodes count as coming from, whatever the dataset says
-    :param kwargs: options of the reader (`filter_key` and `observation_keys` for robomimic files, see also :func:`load_npz`)
+    :param kwargs: options of the reader: `on_invalid`, which is "raise" unless "drop" leaves episodes out that would be
+        refused, with a warning that names their number and the first reason; `filter_key` and `observation_keys` for
+        robomimic files, see also :func:`load_npz`
     :raises DatasetError: `dataset` is nothing of the above, its reader refuses it, or its cache cannot be used
     :raises TypeError: the reader has no such option
     """

@@ -3,8 +3,8 @@
 import json
 import os
 import re
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -12,8 +12,9 @@ from gymnasium import spaces
 
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, existing_file
+from sb3_dtfm.data.hdf5 import listed, open_group, open_hdf5, read_hdf5
 from sb3_dtfm.data.storage import FileStorage
-from sb3_dtfm.data.trajectories import DatasetError, Trajectory
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_finite, check_flags, naming
 from sb3_dtfm.envs.robosuite import env_id_from_robomimic
 
 DEFAULT_OBSERVATION_KEYS = ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos", "object")
@@ -47,6 +48,7 @@ def load_robomimic(
     path: str | os.PathLike[str],
     filter_key: str | None = None,
     observation_keys: Sequence[str] | None = None,
+    on_invalid: str = "raise",
     storage: FileStorage | None = None,
 ) -> TrajectoryBuffer:
     """
@@ -65,6 +67,7 @@ def load_robomimic(
     :param filter_key: read only the demonstrations listed in `mask/<filter_key>`, such as "train"
     :param observation_keys: which of a demonstration's `obs` make up the observation, in this order; robomimic's
         low-dimensional ones by default
+    :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
     :param storage: where the steps go, memory if not given
     :return: actions in the controller's input range, [-1, 1] if the file says nothing else
     :raises DatasetError: no such file, not readable, nothing in it, unknown keys, wrong shapes, NaN or infinity, or actions
@@ -72,53 +75,80 @@ def load_robomimic(
     """
     path = existing_file(path, EXPECTED)
     source = str(path)
-    try:
-        if not h5py.is_hdf5(path):
-            raise DatasetError(f"{source}: not an hdf5 file; a robomimic hdf5 file is expected.")
-        with h5py.File(path, "r") as file:
-            return _read(file, source, filter_key, tuple(observation_keys or DEFAULT_OBSERVATION_KEYS), storage)
-    except OSError as error:
-        raise DatasetError(f"{source}: cannot be read to the end ({error}); is the file cut off?") from error
+    if not h5py.is_hdf5(path):
+        raise DatasetError(f"{source}: not an hdf5 file; a robomimic hdf5 file is expected.")
+    with naming(source), h5py.File(path, "r") as file:
+        return _read(file, source, filter_key, tuple(observation_keys or DEFAULT_OBSERVATION_KEYS), on_invalid, storage)
+
+
+class _Labels(NamedTuple):
+    """Of one demonstration of T steps: rewards and dones, (T,) each, None where the file has none."""
+
+    rewards: np.ndarray | None
+    dones: np.ndarray | None
+    n_steps: int
+    n_actions: int
 
 
 def _read(
-    file: h5py.File, source: str, filter_key: str | None, observation_keys: tuple[str, ...], storage: FileStorage | None
+    file: h5py.File,
+    source: str,
+    filter_key: str | None,
+    observation_keys: tuple[str, ...],
+    on_invalid: str,
+    storage: FileStorage | None,
 ) -> TrajectoryBuffer:
-    data = file.get("data")
-    if not isinstance(data, h5py.Group):
-        raise DatasetError(f"{source}: has no group 'data', only {_listed(file)}; a robomimic hdf5 file is expected.")
-    all_demos = sorted((name for name in data if isinstance(data[name], h5py.Group)), key=_number)
+    data = open_group(file, "data", source)
+    all_demos = sorted(data, key=_number)
     if not all_demos:
         raise DatasetError(f"{source}: group 'data' holds no demonstration; at least one ('demo_0') is needed.")
     demos = all_demos if filter_key is None else _filtered(file, source, filter_key, all_demos)
     env_args = _env_args(data, source)
-    steps = {name: _n_steps(data[name], f"{source}, {name}") for name in all_demos}
-    labels = {name: _labels(data[name], f"{source}, {name}", steps[name]) for name in all_demos}
-    rewards = _rewards(labels, steps)
-    n_actions = data[demos[0]]["actions"].shape[1]
+    groups: dict[str, h5py.Group] = {}
+    labels: dict[str, _Labels] = {}
+    refused: dict[str, DatasetError] = {}
+    for name in all_demos:  # what counts as a success is seen in all of them
+        try:
+            groups[name] = open_group(data, name, source)
+            labels[name] = _labels(groups[name], f"{source}, {name}")
+        except DatasetError as error:
+            refused[name] = error
+    if not refused:
+        _check_count(data, "total", sum(demo.n_steps for demo in labels.values()), source)
+    rewards = _rewards(labels)
 
-    def trajectories() -> Iterator[Trajectory]:
-        for name in demos:
-            length, dones = len(rewards[name]), labels[name][1]
-            observations = _observations(data[name], f"{source}, {name}", steps[name], observation_keys)
+    def trajectory(name: str) -> Trajectory:
+        if name in refused:
+            raise refused[name]
+        where = f"{source}, {name}"
+        with naming(where):
+            length, dones = len(rewards[name]), labels[name].dones
+            observations = _observations(groups[name], where, labels[name].n_steps, observation_keys)
             success = bool(rewards[name][-1] >= 1.0)
             done = dones is not None and bool(dones[length - 1])
-            yield Trajectory(
+            return Trajectory(
                 observations=_present_object_state(observations, observation_keys, env_args)[:length],
-                actions=np.asarray(data[name]["actions"][:length]),
+                actions=read_hdf5(groups[name], "actions", where)[:length],
                 rewards=rewards[name],
                 terminated=success,
                 truncated=done and not success,
                 name=name,
             )
 
+    with naming(f"{source}: attribute 'env_args' of group 'data'"):
+        env_id = env_id_from_robomimic(env_args)
+    n_actions = next((labels[name].n_actions for name in demos if name in labels), None)
+    if n_actions is None:
+        raise refused[demos[0]]
     return TrajectoryBuffer.from_trajectories(
-        trajectories(),
+        map(trajectory, demos),
         action_space=_action_space(env_args, n_actions, source),
-        n_steps=sum(len(rewards[name]) for name in demos),
+        n_steps=sum(len(rewards[name]) for name in demos if name in rewards),
         source=source,
-        env_id=env_id_from_robomimic(env_args),
+        env_id=env_id,
         storage=storage,
+        on_invalid=on_invalid,
+        n_stored=os.path.getsize(source),
     )
 
 
@@ -128,16 +158,12 @@ def _number(name: str) -> tuple[int, str]:
     return (int(digits[1]) if digits else -1, name)
 
 
-def _listed(names: Any) -> str:
-    return ", ".join(map(repr, sorted(names))) or "nothing"
-
-
 def _filtered(file: h5py.File, source: str, filter_key: str, demos: list[str]) -> list[str]:
     masks = file.get("mask", {})
     if filter_key not in masks:
-        raise DatasetError(f"{source}: has no filter key {filter_key!r}; available: {_listed(masks)}.")
-    listed = np.asarray(masks[filter_key][()]).reshape(-1).tolist()
-    names = [name.decode() if isinstance(name, bytes) else str(name) for name in listed]
+        raise DatasetError(f"{source}: has no filter key {filter_key!r}; available: {listed(masks)}.")
+    chosen = np.asarray(masks[filter_key][()]).reshape(-1).tolist()
+    names = [name.decode() if isinstance(name, bytes) else str(name) for name in chosen]
     missing = sorted(set(names) - set(demos), key=_number)
     if missing:
         raise DatasetError(f"{source}: filter key {filter_key!r} lists {missing[0]!r}, which is not in group 'data'.")
@@ -147,54 +173,54 @@ def _filtered(file: h5py.File, source: str, filter_key: str, demos: list[str]) -
 
 
 def _env_args(data: h5py.Group, source: str) -> dict[str, Any]:
-    text = data.attrs.get("env_args", "{}")
-    try:
-        env_args = json.loads(text)
-    except (TypeError, ValueError) as error:
-        raise DatasetError(f"{source}: attribute 'env_args' of group 'data' is not JSON ({error}).") from error
+    with naming(f"{source}: attribute 'env_args' of group 'data' is not JSON"):
+        env_args = json.loads(data.attrs.get("env_args", "{}"))
     return env_args if isinstance(env_args, dict) else {}
 
 
-def _n_steps(demo: h5py.Group, where: str) -> int:
-    actions = demo.get("actions")
-    if not isinstance(actions, h5py.Dataset):
-        raise DatasetError(f"{where}: has no 'actions', only {_listed(demo)}.")
-    if actions.ndim != 2 or len(actions) == 0:
-        raise DatasetError(
-            f"{where}: actions have shape {actions.shape}, expected (steps, dimensions) of at least one step."
-        )
-    return len(actions)
+def _check_count(group: h5py.Group, name: str, n_steps: int, where: str) -> None:
+    """Compare with the number of steps that the file itself tells of, if it does."""
+    told = group.attrs.get(name, n_steps)
+    if not np.array_equal(told, n_steps):
+        raise DatasetError(f"{where}: attribute {name!r} tells of {told} steps; there are {n_steps}.")
 
 
-def _labels(demo: h5py.Group, where: str, n_steps: int) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Rewards and dones, (T,) each, None where the file has none."""
-    labels: list[np.ndarray | None] = []
-    for name in ("rewards", "dones"):
-        if name not in demo:
-            labels.append(None)
-            continue
-        array = np.asarray(demo[name][()])
-        if array.size != n_steps:
-            raise DatasetError(f"{where}: {name} have shape {array.shape}, expected ({n_steps},), one for each action.")
-        labels.append(array.reshape(n_steps))
-    return labels[0], labels[1]
+def _labels(demo: h5py.Group, where: str) -> _Labels:
+    _, shape, _ = open_hdf5(demo, "actions", where)
+    if len(shape) != 2 or 0 in shape:
+        raise DatasetError(f"{where}: actions have shape {shape}, expected (steps, dimensions) of at least one step.")
+    n_steps, n_actions = shape
+    rewards = dones = None
+    if "rewards" in set(demo):  # a link into nothing, too
+        rewards = read_hdf5(demo, "rewards", where)
+        if rewards.size != n_steps or rewards.shape[:1] != (n_steps,):
+            raise DatasetError(f"{where}: rewards have shape {rewards.shape}, expected ({n_steps},), one for each action.")
+        rewards = rewards.reshape(n_steps)
+        check_finite(rewards, "rewards", where)
+    if "dones" in set(demo):
+        dones = check_flags(read_hdf5(demo, "dones", where), n_steps, f"{where}: dones")
+    with naming(where):
+        _check_count(demo, "num_samples", n_steps, where)
+    return _Labels(rewards, dones, n_steps, n_actions)
 
 
-def _rewards(labels: dict[str, tuple[np.ndarray | None, np.ndarray | None]], steps: dict[str, int]) -> dict[str, np.ndarray]:
+def _rewards(labels: dict[str, _Labels]) -> dict[str, np.ndarray]:
     """Rewards as the environment gives them, cut after the first success; see :func:`load_robomimic`."""
-    stored = {name: np.zeros(steps[name]) if array is None else array.astype(float) for name, (array, _) in labels.items()}
+    stored = {
+        name: np.zeros(demo.n_steps) if demo.rewards is None else demo.rewards.astype(float) for name, demo in labels.items()
+    }
     if not all(np.isin(array, (0.0, 1.0)).all() for array in stored.values()):
         return stored
     rewarded = any(array.any() for array in stored.values())
     rewards = {}
     for name, array in stored.items():
-        dones = labels[name][1]
+        dones = labels[name].dones
         marks = array if rewarded or dones is None else dones
         successes = np.flatnonzero(marks)
         if len(successes) == 0 and rewarded:
             rewards[name] = array
             continue
-        length = int(successes[0]) + 1 if len(successes) else steps[name]
+        length = int(successes[0]) + 1 if len(successes) else len(array)
         rewards[name] = np.zeros(length)
         rewards[name][-1] = 1.0
     return rewards
@@ -202,15 +228,13 @@ def _rewards(labels: dict[str, tuple[np.ndarray | None, np.ndarray | None]], ste
 
 def _observations(demo: h5py.Group, where: str, n_steps: int, keys: tuple[str, ...]) -> np.ndarray:
     """The chosen observations side by side, (T, O)."""
-    group = demo.get("obs")
-    if not isinstance(group, h5py.Group):
-        raise DatasetError(f"{where}: has no group 'obs', only {_listed(demo)}; observations must be in the file.")
-    parts = []
+    group = open_group(demo, "obs", where)
+    names, parts = set(group), []
     for key in keys:
-        name = key if key in group else ALIASES.get(key, key)
-        if name not in group:
-            raise DatasetError(f"{where}: has no observation {key!r}; available: {_listed(group)}.")
-        array = np.asarray(group[name][()])
+        name = key if key in names else ALIASES.get(key, key)
+        if name not in names:
+            raise DatasetError(f"{where}: has no observation {key!r}; available: {listed(group)}.")
+        array = read_hdf5(group, name, where)
         if array.ndim == 1:
             array = array[:, None]
         if array.ndim != 2 or len(array) != n_steps:
@@ -259,11 +283,12 @@ def _in_frame(vectors: np.ndarray, quaternions: np.ndarray) -> np.ndarray:
 
 def _action_space(env_args: dict[str, Any], n_actions: int, source: str) -> spaces.Box:
     """The controller's input range for the arm, [-1, 1] for the gripper and where the file says nothing."""
-    config = env_args.get("env_kwargs", {}).get("controller_configs") or {}
-    config = config[0] if isinstance(config, list) else config
-    arm = config.get("body_parts", {}).get("right", config)
-    if arm.get("input_type", "delta") != "delta" or arm.get("control_delta", True) is False:
-        raise DatasetError(f"{source}: actions are absolute poses; only files with a delta controller are accepted.")
-    low, high = -np.ones(n_actions, np.float32), np.ones(n_actions, np.float32)
-    low[: n_actions - 1], high[: n_actions - 1] = arm.get("input_min", -1.0), arm.get("input_max", 1.0)
-    return spaces.Box(low, high, dtype=np.float32)
+    with naming(f"{source}: attribute 'env_args' of group 'data'"):
+        config = env_args.get("env_kwargs", {}).get("controller_configs") or {}
+        config = config[0] if isinstance(config, list) else config
+        arm = config.get("body_parts", {}).get("right", config)
+        if arm.get("input_type", "delta") != "delta" or arm.get("control_delta", True) is False:
+            raise DatasetError(f"{source}: actions are absolute poses; only files with a delta controller are accepted.")
+        low, high = -np.ones(n_actions, np.float32), np.ones(n_actions, np.float32)
+        low[: n_actions - 1], high[: n_actions - 1] = arm.get("input_min", -1.0), arm.get("input_max", 1.0)
+        return spaces.Box(low, high, dtype=np.float32)

@@ -1,6 +1,9 @@
 """Where the flat arrays of a buffer's steps go while episodes are read: memory, or files that are then memory-mapped."""
 
+import concurrent.futures
+import contextlib
 import mmap
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -86,7 +89,7 @@ class FileStorage:
         :param steps: (T, ...) for each of `STEP_ARRAYS`
         :raises DatasetError: the disk is full, for example
         """
-        try:
+        with self._writing():
             for name, values in steps.items():
                 if name not in self._files:
                     path = step_file(self.folder, name)
@@ -94,10 +97,15 @@ class FileStorage:
                     self._shapes[name] = values.shape[1:]
                     self._write_header(name)
                 self._files[name].write(np.ascontiguousarray(values, np.float32).data)
-        except OSError as error:  # a reader would take it for an error of the file that it reads
-            raise DatasetError(f"cache {self.folder} cannot be written: {error}") from error
         self._n_steps += len(steps["rewards"])
         self._bar.update(len(steps["rewards"]))
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:  # a reader would take it for an error of the file that it reads
+            raise DatasetError(f"cache {self.folder} cannot be written: {error}") from error
 
     def _write_header(self, name: str) -> None:
         header = {"descr": "<f4", "fortran_order": False, "shape": (self._n_steps, *self._shapes[name])}
@@ -105,10 +113,11 @@ class FileStorage:
 
     def finish(self) -> dict[str, th.Tensor]:
         """The tensors, (N, ...) each, mapped from the files."""
-        for name, file in self._files.items():
-            file.seek(0)
-            self._write_header(name)  # of the same length: numpy leaves room for the number of rows
-        self.close()
+        with self._writing():
+            for name, file in self._files.items():
+                file.seek(0)
+                self._write_header(name)  # of the same length: numpy leaves room for the number of rows
+            self.close()
         return {name: MappedSteps(self.folder, name).tensor for name in STEP_ARRAYS}
 
     def close(self) -> None:
@@ -133,6 +142,7 @@ class MappedSteps:
 
     :param folder: of a cache
     :param name: one of `STEP_ARRAYS`
+    :ivar check: of the cache's files, where it still goes on
     :raises OSError: no such file
     :raises ValueError: not a npy file, or cut off
     """
@@ -141,6 +151,7 @@ class MappedSteps:
         # Copy on write: torch has no read-only tensors, and nothing that is written to one may reach the file.
         array = np.load(step_file(folder, name), mmap_mode="c")
         self.name = name
+        self.check: concurrent.futures.Future[None] | None = None
         self.tensor = th.from_numpy(array)
         self._map: mmap.mmap = array.base
         if CAN_ADVISE:
@@ -154,7 +165,10 @@ class MappedSteps:
 
         :param stops: the rows that end before each of these
         :param n_rows: how many rows each time
+        :raises DatasetError: a file of the cache has turned out to be damaged
         """
+        if self.check is not None and self.check.done():
+            self.check.result()
         for stop in stops if CAN_ADVISE else ():
             start_byte = self._data_offset + max(0, stop - n_rows) * self._row_bytes
             start_byte -= start_byte % mmap.PAGESIZE

@@ -1,19 +1,90 @@
 """One recorded episode: what it holds, what makes it unfit for learning, and the return-to-go of its steps."""
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 
 # Recorded float64 actions may pass a float32 bound by a rounding error; beyond this share of the range they are wrong.
 ACTION_TOLERANCE = 1e-4
+# The kinds of NumPy's types that are real numbers: float, int, unsigned, bool.
+REAL = "fiub"
+# An array may take this many times the bytes that are stored of it, and this many bytes more: far less than a file of
+# some kilobytes can claim, and more than compression makes of any recording.
+LARGEST_EXPANSION, SMALL_ARRAY = 100, 2**24
 # Numbers whose squares sum to less than this are all finite in float32; above, each has to be looked at.
 SURELY_FINITE = 1e37
 
 
 class DatasetError(ValueError):
     """A dataset cannot be used. The message names the file, episode and step, what was found and what is accepted."""
+
+
+@contextlib.contextmanager
+def naming(where: str) -> Iterator[None]:
+    """
+    Whatever the libraries that read a file raise over it becomes our own error, which says where.
+
+    :param where: the file, and the episode or field that is read
+    :raises DatasetError: instead of any other exception
+    """
+    try:
+        yield
+    except DatasetError:
+        raise
+    except Exception as error:  # over damaged files they raise nearly everything
+        what = f"{type(error).__name__}: {error}"
+        raise DatasetError(f"{where}: cannot be read ({what}); the file is damaged or incomplete, or cut off.") from error
+
+
+def check_real(dtype: Any, where: str) -> None:
+    """
+    Refuse what is no real number before it is read, or cast to one.
+
+    :param dtype: of an array
+    :param where: the file, the episode and the array
+    :raises DatasetError: complex numbers, words, objects, records, dates
+    """
+    if np.dtype(dtype).kind not in REAL:
+        raise DatasetError(f"{where} hold {dtype}; real numbers are expected.")
+
+
+def check_size(n_bytes: int, n_stored: int, where: str) -> None:
+    """
+    Refuse an array that claims to be far larger than what is stored of it, before memory is taken for it.
+
+    :param n_bytes: what it would take in memory
+    :param n_stored: bytes in the file
+    :param where: the file, the episode and the array
+    :raises DatasetError: it does
+    """
+    if n_bytes > SMALL_ARRAY + LARGEST_EXPANSION * n_stored:
+        raise DatasetError(
+            f"{where} claim {n_bytes} bytes, of which {n_stored} are stored; the file is damaged or incomplete."
+        )
+
+
+def check_flags(flags: np.ndarray, n_steps: int, where: str) -> np.ndarray:
+    """
+    What is marked at each step.
+
+    :param flags: (T,) or (T, 1), zeros and ones of any type
+    :param n_steps: T
+    :param where: the file, the episode and the array
+    :return: (T,) bool
+    :raises DatasetError: another shape, or another value
+    """
+    check_real(flags.dtype, where)
+    if flags.size != n_steps or flags.shape[:1] != (n_steps,):
+        raise DatasetError(f"{where} have shape {flags.shape}, expected ({n_steps},), one for each action.")
+    flags = flags.reshape(n_steps)
+    if flags.dtype != bool and not ((flags == 0) | (flags == 1)).all():
+        step = int(np.argmax((flags != 0) & (flags != 1)))
+        raise DatasetError(f"{where} hold {flags[step]} at step {step}; 0 and 1 are accepted.")
+    return flags.astype(bool)
 
 
 @dataclass(frozen=True)
@@ -89,13 +160,17 @@ def check_action_space(space: spaces.Space, source: str) -> spaces.Box:
     return space
 
 
-def check_trajectory(trajectory: Trajectory, observation_space: spaces.Box, action_space: spaces.Box, source: str) -> None:
+def check_trajectory(
+    trajectory: Trajectory, observation_space: spaces.Box, action_space: spaces.Box, source: str
+) -> np.ndarray:
     """
     Refuse an episode that training must not see.
 
+    :return: (T,) float64, the returns-to-go, which have been looked at, too
     :raises DatasetError: names source, episode and step, what was found and what is accepted
     """
-    if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
+    shape = observation_space.shape
+    if not isinstance(observation_space, spaces.Box) or len(shape) != 1 or shape == (0,):
         found = f"the observation space is {observation_space}"
         raise DatasetError(f"{source}: {found}; only a Box of shape (O,) can be learnt from.")
     where = f"{source}, {trajectory.name}"
@@ -109,11 +184,10 @@ def check_trajectory(trajectory: Trajectory, observation_space: spaces.Box, acti
     }
     for name, shape in expected.items():
         array = getattr(trajectory, name)
+        check_real(np.asarray(array).dtype, f"{where}: {name}")
         if np.shape(array) != shape:
             raise DatasetError(f"{where}: {name} have shape {np.shape(array)}, expected {shape}.")
-        # One number per array tells nearly always that all is well; it is NaN or infinite if any entry is.
-        if not np.vdot(array, array) < SURELY_FINITE:
-            _refuse_infinite(array, name, where)
+        check_finite(array, name, where)
     slack = ACTION_TOLERANCE * (action_space.high - action_space.low)
     low, high = action_space.low - slack, action_space.high + slack
     if not ((trajectory.actions >= low).all() and (trajectory.actions <= high).all()):
@@ -123,10 +197,23 @@ def check_trajectory(trajectory: Trajectory, observation_space: spaces.Box, acti
             f"{where}, step {step}: action {trajectory.actions[step, dimension]:g} in dimension {dimension} lies outside of "
             f"the action space [{action_space.low[dimension]:g}, {action_space.high[dimension]:g}]."
         )
+    to_go = returns_to_go(trajectory.rewards)
+    check_finite(to_go, "returns-to-go, sums of rewards,", where)
+    return to_go
 
 
-def _refuse_infinite(array: np.ndarray, name: str, where: str) -> None:
-    """Name the first number that is NaN or too large for float32, if there is one."""
+def check_finite(array: np.ndarray, name: str, where: str) -> None:
+    """
+    Refuse what float32 cannot hold.
+
+    :param array: (T,) or (T, .), real numbers of any type
+    :param name: what they are
+    :param where: the file and the episode
+    :raises DatasetError: names the first step whose number is NaN, infinite or too large
+    """
+    # One number per array tells nearly always that all is well; it is NaN or infinite if any entry is.
+    if np.vdot(array, array) < SURELY_FINITE:
+        return
     bad = ~(np.abs(array) <= np.finfo(np.float32).max)  # also True for NaN
     if bad.any():
         index = tuple(int(i) for i in np.argwhere(bad)[0])

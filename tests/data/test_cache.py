@@ -1,9 +1,12 @@
 """Memory-mapped caches: the same data as from memory, made anew when the dataset changes, refused when damaged."""
 
+import concurrent.futures
+import contextlib
 import itertools
 import json
 import mmap
 import os
+import shutil
 import subprocess
 import sys
 import warnings
@@ -18,7 +21,7 @@ import torch as th
 from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
 
-from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer, load_dataset
+from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer, cache, load_dataset
 from sb3_dtfm.data.cache import FORMAT, Fingerprint, load_cached
 from sb3_dtfm.data.storage import CAN_ADVISE, STEP_ARRAYS, FileStorage, step_file
 from tests.data.small import ACTION_SPACE, OBSERVATION_SPACE, make_buffer, make_trajectory
@@ -249,6 +252,107 @@ def test_a_damaged_cache_is_refused_with_what_to_do(name: str, damage: str, robo
         file.write_bytes(content[: len(content) - 4 if damage == "cut off" else 0])
     with pytest.raises(DatasetError, match=rf"{name} is damaged .*; delete this folder to have it built anew"):
         load(robomimic_file, tmp_path / "cache")
+
+
+def test_no_flipped_byte_of_a_cache_is_learned_from(robomimic_file: Path, tmp_path: Path):
+    """Refused, or built anew where the cache no longer says what it is of."""
+    right = load(robomimic_file, None)
+    load(robomimic_file, tmp_path / "cache")
+    rng, refused = np.random.default_rng(0), 0
+    for _ in range(60):
+        file = rng.choice(sorted(only_folder(tmp_path / "cache").iterdir()))
+        content = bytearray(file.read_bytes())
+        content[rng.integers(len(content))] ^= 1 << int(rng.integers(8))
+        file.write_bytes(content)
+        try:
+            assert_same(load(robomimic_file, tmp_path / "cache"), right)
+        except DatasetError as error:
+            assert f"{file.name} is damaged" in str(error)  # noqa: PT017
+            refused += 1
+        shutil.rmtree(tmp_path / "cache")
+        load(robomimic_file, tmp_path / "cache")
+    assert refused > 40
+
+
+def test_files_are_checked_once_in_a_process(robomimic_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    load(robomimic_file, tmp_path / "cache")
+    monkeypatch.setattr(cache, "_file_digest", forbidden)
+    load(robomimic_file, tmp_path / "cache")
+
+
+def forbidden(*args: object) -> None:
+    raise AssertionError("looked at again")
+
+
+def test_a_large_file_is_checked_in_the_background_and_told_of_by_the_batch_after(
+    robomimic_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    load(robomimic_file, tmp_path / "cache")
+    file = only_folder(tmp_path / "cache") / "rewards.npy"
+    file.write_bytes(file.read_bytes()[:-1] + b"\x01")
+    monkeypatch.setattr(cache, "LARGE", 0)
+    buffer = load(robomimic_file, tmp_path / "cache")
+    concurrent.futures.wait([buffer._maps[0].check], timeout=10)
+    with pytest.raises(DatasetError, match=r"rewards.npy is damaged .not as it was written.; delete this folder"):
+        next(buffer.batches(2, 2, th.Generator().manual_seed(0)))
+
+
+@pytest.mark.parametrize("killed_at", range(12))
+def test_a_build_that_is_killed_anywhere_leaves_nothing_that_disturbs_the_next_one(
+    killed_at: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Of the renames, removals and files that take an outdated cache's place, it ends before each in turn."""
+    fingerprints = [Fingerprint("set", "", "", state) for state in ("old", "new")]
+    load_cached(tmp_path, fingerprints[0], fill([4]))
+    count = itertools.count()
+
+    def mortal(act: Callable[..., object]) -> Callable[..., object]:
+        def wrapper(*args: object, **kwargs: object) -> object:
+            if next(count) >= killed_at:  # nothing tidies up after it
+                raise Killed
+            return act(*args, **kwargs)
+
+        return wrapper
+
+    with monkeypatch.context() as patch:
+        for owner, name in (
+            (os, "unlink"),
+            (os, "rmdir"),
+            (Path, "rename"),
+            (Path, "mkdir"),
+            (np, "savez"),
+            (Path, "write_text"),
+        ):
+            patch.setattr(owner, name, mortal(getattr(owner, name)))
+        patch.setattr(cache.contextlib, "closing", contextlib.nullcontext)
+        with contextlib.suppress(Killed):
+            load_cached(tmp_path, fingerprints[1], fill([5, 3]))
+    assert_same(load_cached(tmp_path, fingerprints[1], fill([5, 3])), make_buffer([5, 3]))
+    assert not [name for name in folders(tmp_path) if name.startswith(".")]
+
+
+class Killed(BaseException):
+    pass
+
+
+def test_a_current_cache_is_opened_from_a_folder_that_cannot_be_written(
+    robomimic_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    load(robomimic_file, tmp_path / "cache")
+    monkeypatch.setattr(cache, "FileLock", forbidden)
+    load(robomimic_file, tmp_path / "cache")
+
+
+def test_a_disk_that_is_full_at_the_end_is_told_in_one_line_and_leaves_no_cache(
+    robomimic_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def full(*args: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(FileStorage, "_write_header", full)
+    with pytest.raises(DatasetError, match=r"^cache .*lift.hdf5.* cannot be written: .*No space left on device$"):
+        load(robomimic_file, tmp_path / "cache")
+    assert folders(tmp_path / "cache") == []
 
 
 def test_a_cache_that_cannot_be_written_is_named(robomimic_file: Path, tmp_path: Path):

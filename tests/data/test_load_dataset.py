@@ -167,7 +167,9 @@ def test_anything_else_is_refused_with_what_is_accepted(dataset: Any):
 
 
 def test_an_unknown_option_is_refused_with_those_there_are(robomimic_file: Path, minari_dataset: minari.MinariDataset):
-    with pytest.raises(TypeError, match="unknown option filter; accepted: filter_key, observation_keys, cache_dir, env_id"):
+    with pytest.raises(
+        TypeError, match="unknown option filter; accepted: filter_key, observation_keys, on_invalid, cache_dir"
+    ):
         load_dataset(robomimic_file, filter="train")
-    with pytest.raises(TypeError, match="test/ones-v0: unknown option filter_key; accepted: cache_dir, env_id"):
+    with pytest.raises(TypeError, match="test/ones-v0: unknown option filter_key; accepted: on_invalid, cache_dir, env_id"):
         load_dataset("test/ones-v0", filter_key="train")

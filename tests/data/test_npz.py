@@ -91,9 +91,9 @@ REFUSED = {
     "infinite actions": (dict(actions=np.full((N, 2), np.inf)), "episode 0, step 0: actions hold inf"),
     "NaN": (dict(observations=np.full((N, 3), np.nan)), "episode 0, step 0: observations hold nan"),
     "flat actions": (dict(actions=np.zeros(N)), r"actions have shape \(9,\); \(N, A\) is expected"),
-    "words": (dict(rewards=np.array(["good"] * N)), "rewards holds <U4; numbers are expected"),
+    "words": (dict(rewards=np.array(["good"] * N)), "rewards hold <U4; real numbers are expected"),
     "two rewards": (dict(rewards=np.zeros((N, 2))), "rewards have 2 columns"),
-    "pickles": (dict(rewards=np.array([print] * N)), "cannot be read .*allow_pickle=False"),
+    "pickles": (dict(rewards=np.array([print] * N)), "rewards hold object; real numbers"),
 }
 
 
@@ -110,11 +110,11 @@ def test_damaged_and_missing_files(path, tmp_path):
     compressed[150:180] = bytes(30)
     for content in (b"", b"no archive", whole[:-200], compressed):
         path.write_bytes(content)
-        with pytest.raises(DatasetError, match=r"episodes.npz: cannot be read"):
+        with pytest.raises(DatasetError, match=r"episodes.npz: .*cannot be read"):
             load_npz(path)
     with path.open("wb") as file:
         np.save(file, np.zeros(3))
-    with pytest.raises(DatasetError, match=r"episodes.npz: holds a single array"):
+    with pytest.raises(DatasetError, match=r"episodes.npz: cannot be read .*not a zip file"):
         load_npz(path)
     with pytest.raises(DatasetError, match=r"none.npz does not exist; the path of a file of flat arrays"):
         load_dataset(tmp_path / "none.npz")
