@@ -168,6 +168,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         self.buffer: TrajectoryBuffer | None = None
         self._means = RunningMeans()
         self._training_seconds, self._timed_steps = 0.0, 0
+        self._last_saved: str | None = None  # by this object
         self._training_seed: int | None = None  # where `seed` is None
         if _init_setup_model:
             self._check_arguments(learning_rate=POSITIVE)
@@ -433,6 +434,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         parameters = self.get_parameters()
         tensors = {POLICY: parameters[POLICY], OPTIMIZER: optimizer_tensors(self.policy.optimizer)}
         write_model(path, ModelFile(to_configuration(self, left_out, wanted), tensors))
+        self._last_saved = file_name(path)
 
     def _excluded_save_params(self) -> list[str]:
         of_an_environment = [
@@ -442,7 +444,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
             "ep_info_buffer",
             "ep_success_buffer",
         ]
-        made_anew = ["lr_schedule", "action_noise", "dataset", "buffer", "_training_seconds", "_timed_steps"]
+        made_anew = ["lr_schedule", "action_noise", "dataset", "buffer", "_training_seconds", "_timed_steps", "_last_saved"]
         return [*super()._excluded_save_params(), *of_an_environment, *made_anew]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

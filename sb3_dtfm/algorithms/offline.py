@@ -1,8 +1,11 @@
 """The offline learn loop."""
 
+import contextlib
 import itertools
 import math
+import re
 import time
+from collections.abc import Iterator
 from typing import Any, TypeVar
 
 import torch as th
@@ -27,6 +30,9 @@ from sb3_dtfm.optimization import (
 from sb3_dtfm.windows import Windows
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineSequenceAlgorithm")
+
+# Episodes that a message shows at most.
+N_EPISODES_SHOWN = 50
 
 
 class OfflineSequenceAlgorithm(OfflineAlgorithm):
@@ -104,7 +110,9 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         :param progress_bar: show one
         :return: the model
         :raises ValueError: no dataset, or an argument out of range
-        :raises FloatingPointError: the loss or its gradient is no longer finite; such a step changes no weight
+        :raises FloatingPointError: the loss or its gradient is no longer finite, with the step, its episodes and the last
+            checkpoint; such a step changes no weight
+        :raises MemoryError: a gradient step needs more than there is, with what decides how much that is
         """
         buffer = self.buffer or self._load_buffer()
         total_timesteps, callback = self._setup_learn(
@@ -130,7 +138,8 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
             generator.manual_seed(step_seed(seed, self._n_updates, NOISE))
             seed_default_generator(self.device, step_seed(seed, self._n_updates, DROPOUT, parallel.rank))
-            self._gradient_step(next(batches), generator, parallel)
+            with self._memory_errors_named():
+                self._gradient_step(next(batches), generator, parallel)
             self.num_timesteps += 1
             self._training_seconds += time.perf_counter() - step_start
             self._timed_steps += 1
@@ -139,7 +148,7 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
             callback.update_locals(locals())
             if not parallel.from_first(callback.on_step()):
                 break
-        self._check_finite(self._means.sums())
+        self._check_finite(self._means.sums(), self._means.n_values)
         callback.on_training_end()
         parallel.close()
         return self
@@ -190,10 +199,11 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
 
         :raises FloatingPointError: the loss or its gradient is no longer finite
         """
-        if self._means.n_values == 0:
+        n_steps = self._means.n_values
+        if n_steps == 0:
             return
         means = self._pop_means()
-        self._check_finite(means)
+        self._check_finite(means, n_steps)
         if is_first_process():
             self._log(means)
         self._training_seconds, self._timed_steps = 0.0, 0
@@ -205,16 +215,47 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         self._training_seconds += time.perf_counter() - start
         return means
 
-    def _check_finite(self, means: dict[str, float]) -> None:
+    def _check_finite(self, means: dict[str, float], n_steps: int = 1) -> None:
         """
+        :param means: over the newest gradient steps
+        :param n_steps: how many these are
         :raises FloatingPointError: the loss or its gradient is no longer finite
         """
         for name in ("loss", "grad_norm"):
             if not math.isfinite(means.get(name, 0.0)):
                 raise FloatingPointError(
-                    f"The {name} became {means[name]} at or before gradient step {self._n_updates} of this model; such "
-                    "steps change no weight. Try a lower learning_rate, warmup_steps or max_grad_norm."
+                    f"The {name} became {means[name]} {self._name_steps(n_steps)}. Such steps change no weight, so the last "
+                    f"checkpoint is good: {self._last_saved or 'none was saved since this model was made or loaded'}. Try a "
+                    "lower learning_rate, warmup_steps or max_grad_norm."
                 )
+
+    def _name_steps(self, n_steps: int) -> str:
+        """Which gradient steps the newest ones are; of a single one, the episodes of its batch, too."""
+        if n_steps > 1:
+            return f"between gradient steps {self._n_updates - n_steps + 1} and {self._n_updates} of this model"
+        assert self.buffer is not None
+        episodes = self.buffer.present_episodes()
+        more = f" and {len(episodes) - N_EPISODES_SHOWN} more" if len(episodes) > N_EPISODES_SHOWN else ""
+        shown = ", ".join(map(str, episodes[:N_EPISODES_SHOWN]))
+        return f"at gradient step {self._n_updates} of this model, whose batch is from episodes {shown}{more} of its buffer"
+
+    @contextlib.contextmanager
+    def _memory_errors_named(self) -> Iterator[None]:
+        """
+        :raises MemoryError: in place of any error of memory, with the settings that decide how much is needed
+        """
+        try:
+            yield
+        except (MemoryError, RuntimeError) as error:
+            # On a CPU torch has no class for it.
+            if isinstance(error, RuntimeError) and not re.search("out of memory|(allocate|enough) memory", str(error), re.I):
+                raise
+            policy = self.policy
+            raise MemoryError(
+                f"A gradient step does not fit into the memory of {self.device}: batch_size={self.batch_size}, "
+                f"context_length={self.context_length}, chunk_size={policy.chunk_size}, embed_dim="
+                f"{policy.network.trunk.embed_dim}, n_layers={policy.network.trunk.n_layers}. Lower batch_size first."
+            ) from error
 
     def _log(self, means: dict[str, float]) -> None:
         for name, mean in means.items():

@@ -70,6 +70,7 @@ class TrajectoryBuffer:
         self.dropped = dropped
         self._maps = maps
         self.device = self.observations.device
+        self._present = th.zeros(0, dtype=th.int64)
         self._set_episodes(episodes)
         if dropped:
             n_all = dropped[0] + len(episodes.lengths)
@@ -329,7 +330,12 @@ class TrajectoryBuffer:
                 yield drawn
 
         for present, _ in itertools.pairwise(ends()):
+            self._present = present
             yield self.windows(present, context_length, n_ahead)
+
+    def present_episodes(self) -> np.ndarray:
+        """The episodes that the newest batch of :meth:`batches` is from: their indices among the buffer's own, in order."""
+        return th.searchsorted(self._stops, self._present, right=True).unique().cpu().numpy()
 
     def sample(self, batch_size: int, context_length: int, generator: th.Generator | None = None) -> Windows:
         """

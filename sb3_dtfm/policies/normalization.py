@@ -11,6 +11,9 @@ from sb3_dtfm.windows import Windows
 
 # Observations are clipped at this many standard deviations, as SB3's VecNormalize does.
 OBSERVATION_CLIP = 10.0
+# Returns-to-go are clipped at this many times the largest one of the data, far beyond what an average over remaining steps
+# makes of them, so that no number overflows on its way through a network.
+RETURN_TO_GO_CLIP = 1e3
 # A dimension whose standard deviation is smaller is a constant, and becomes zero.
 SMALLEST_STD = 1e-6
 
@@ -91,7 +94,7 @@ class Normalization(nn.Module):
     def forward(self, windows: Windows) -> Windows:
         """
         :param windows: tensors; observations and returns-to-go as the environment gives them
-        :return: observations normalised and clipped, returns-to-go scaled to at most about 1, the others as they are
+        :return: observations normalised and clipped, returns-to-go scaled to about 1 and clipped, the others as they are
         """
         observations = (windows.observations - self.observation_mean) / self.observation_std
         returns_to_go = windows.returns_to_go
@@ -103,7 +106,7 @@ class Normalization(nn.Module):
             returns_to_go = returns_to_go * (self.max_timestep / remaining)
         return windows._replace(
             observations=observations.clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP) * self.observation_gain,
-            returns_to_go=returns_to_go / self.return_scale,
+            returns_to_go=(returns_to_go / self.return_scale).clamp(-RETURN_TO_GO_CLIP, RETURN_TO_GO_CLIP),
         )
 
     def scale_action(self, action: Any) -> Any:

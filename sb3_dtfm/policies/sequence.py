@@ -4,7 +4,7 @@ import copy
 import inspect
 import json
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 import torch as th
@@ -19,7 +19,7 @@ from sb3_dtfm.networks.cpu import hand_out, take_up
 from sb3_dtfm.networks.trunk import SequenceTrunk
 from sb3_dtfm.policies.memory import RememberedContext
 from sb3_dtfm.policies.normalization import Normalization
-from sb3_dtfm.windows import Context, Windows, empty_context, push, restarts, unpack_observation, with_plan
+from sb3_dtfm.windows import Context, Windows, check_context, empty_context, push, restarts, unpack_observation, with_plan
 
 # Rows of the table that deterministic acting takes its noise from.
 NOISE_ROWS = 1024
@@ -280,29 +280,33 @@ class SequencePolicy(BasePolicy):
         enough: a row starts anew where its time step is not the last one plus one, and is asked again where both time step
         and observation are the last ones. :meth:`reset` forgets it.
 
+        Actions are finite and inside the action space. What cannot be acted on is an error before anything has changed: the
+        caller mends the row that it names, or begins it anew, and asks again; the other rows go on as if nothing had been.
+
         :param observation: Dict of `observation` (O,), `return_to_go` (1,), `timestep` (1,), or with a leading axis B
         :param state: what the last call returned
         :param episode_start: (B,) bool, True where an environment was just reset
         :param deterministic: repeat exactly for the same model, state and inputs; otherwise draw fresh noise
         :return: actions (A,) or (B, A) in the environment's range, and the next state
-        :raises ValueError: not the observation of a `ReturnToGoWrapper`, or a state of other environments
+        :raises ValueError: not the observation of a `ReturnToGoWrapper`; a number that is not finite or a time step that is
+            none, by key and row; a state of other environments, or one that holds no finite numbers
         """
         arrays, vectorized = unpack_observation(observation, self.observation_dim)
         n_rows, timestep = len(arrays[0]), arrays[2]
         remembers = state is None and episode_start is None
-        before = Context(*state) if state is not None else None
+        nothing = self._empty_context(n_rows)
+        before = check_context(state, nothing) if state is not None else None
+        if episode_start is not None:
+            episode_start = _check_episode_start(episode_start, n_rows)
         if remembers:
             before = self._remembered.recall(arrays[0], timestep)
         if before is None:
-            before = self._empty_context(n_rows)
-        if before.observations.shape != (expected := (n_rows, self.context_length, self.observation_dim)):
-            raise ValueError(f"state holds observations of shape {before.observations.shape}; {expected} is expected.")
-        if before.plan.shape[1] != self.n_action_steps - 1:  # it was another number then
-            nothing = self._empty_context(n_rows)
+            before = nothing
+        if before.plan.shape != nothing.plan.shape:  # another number of steps was planned then
             before = before._replace(plan=nothing.plan, n_planned=nothing.n_planned)
         lost = restarts(before, timestep) & (timestep > 0)
         if episode_start is not None:
-            lost &= ~np.asarray(episode_start, dtype=bool)
+            lost &= ~episode_start
         if lost.any():
             self._remembered.warn(f"Time step {timestep[lost][0]} follows none that is known: its past is missing.")
         context = push(before, *arrays, episode_start=episode_start)
@@ -326,13 +330,36 @@ class SequencePolicy(BasePolicy):
         return empty_context(n_rows, *sizes, plan_length=self.n_action_steps - 1)
 
     def _act(self, context: Context, deterministic: bool) -> Context:
-        """Fill in the newest step's actions, in [-1, 1]: planned ones, and chosen ones where none are left."""
+        """
+        Fill in the newest step's actions, in [-1, 1]: planned ones, and chosen ones where none are left.
+
+        :raises ValueError: they would not be finite
+        """
         if self.training:
             self.set_training_mode(False)  # goes through all modules
         due = context.n_planned == 0
         with th.inference_mode():
             chunks, keys_values = self._choose(context, due, deterministic)
+        if not (fits := np.isfinite(chunks)).all():
+            self._refuse(context, np.flatnonzero(due)[~fits.all(axis=(1, 2))])
         return with_plan(context, due, chunks[:, : self.n_action_steps])._replace(keys_values=keys_values)
+
+    @staticmethod
+    def _refuse(context: Context, rows: np.ndarray) -> NoReturn:
+        """
+        Say why there is no finite action for some rows, although what `predict` lets in is finite.
+
+        :param rows: their indices
+        :raises ValueError: always
+        """
+        names = [name for name, array in context._asdict().items() if not np.isfinite(array[rows]).all()]
+        largest = np.abs(context.returns_to_go[rows]).max()
+        cause = (
+            f"state holds NaN or infinity in {', '.join(names)}. Begin these rows anew with episode_start."
+            if names
+            else f"the policy's weights give none for a return_to_go of {largest:g}. Ask for less, or load other weights."
+        )
+        raise ValueError(f"There is no finite action in row {', '.join(map(str, rows))}: {cause}")
 
     def _choose(self, context: Context, due: np.ndarray, deterministic: bool) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -470,6 +497,17 @@ def _own_parameters() -> set[str]:
     parameters = inspect.signature(SequencePolicy.__init__).parameters.values()
     given_by_sb3 = ("self", "observation_space", "action_space", "lr_schedule")
     return {each.name for each in parameters if each.kind is not each.VAR_KEYWORD and each.name not in given_by_sb3}
+
+
+def _check_episode_start(episode_start: Any, n_rows: int) -> np.ndarray:
+    """
+    :return: (B,) bool, or (1,) for all rows alike
+    :raises ValueError: not one for each row, nor one for all
+    """
+    starts = np.asarray(episode_start, dtype=bool).reshape(-1)
+    if len(starts) not in (1, n_rows):
+        raise ValueError(f"episode_start has shape {np.shape(episode_start)}; ({n_rows},) is expected.")
+    return starts
 
 
 def standard_normal(n_rows: int, dim: int, generator: th.Generator) -> th.Tensor:

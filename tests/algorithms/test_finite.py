@@ -7,6 +7,7 @@ from stable_baselines3.common.callbacks import CheckpointCallback
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.optimization import RunningMeans
 from tests.algorithms.small import make_model
+from tests.conftest import EPISODE_LENGTH
 
 # Steps so long that the next loss, or its gradient, leaves the range of float32.
 DIVERGING = dict(learning_rate=1e30, precision="float32", weight_decay=0.0)
@@ -52,3 +53,36 @@ def test_the_end_of_learning_looks_once_more(cheetah_buffer, monkeypatch):
     monkeypatch.setattr(RunningMeans, "sums", lambda means: {"loss": float("nan"), "grad_norm": 1.0})
     with pytest.raises(FloatingPointError, match="loss became nan"):
         make_model(DT, cheetah_buffer).learn(1, log_interval=None)
+
+
+def test_the_error_names_step_episodes_and_the_last_checkpoint(cheetah_buffer, tmp_path, monkeypatch):
+    """And comes before the callbacks of its step: no checkpoint is of that step."""
+    model = make_model(DT, cheetah_buffer, batch_size=1)
+    compute_loss = model.policy.compute_loss
+    sick = cheetah_buffer.observations[3 * EPISODE_LENGTH : 4 * EPISODE_LENGTH]
+
+    def spoiled(batch, *noise):
+        loss, parts = compute_loss(batch, *noise)
+        return loss * (float("nan") if (batch.observations[0, -1] == sick).all(dim=1).any() else 1.0), parts
+
+    monkeypatch.setattr(model.policy, "compute_loss", spoiled)
+    with pytest.raises(FloatingPointError, match="loss became nan") as caught:
+        model.learn(100, callback=CheckpointCallback(1, str(tmp_path)))
+    n_good = model.num_timesteps
+    assert 0 < n_good < 99
+    assert f"at gradient step {n_good + 1} of this model, whose batch is from episodes 3 of its buffer" in str(caught.value)
+    assert f"the last checkpoint is good: {tmp_path}/rl_model_{n_good}_steps.zip." in str(caught.value)
+    assert len(list(tmp_path.glob("*.zip"))) == n_good
+
+
+def test_a_model_that_was_not_saved_says_so_and_steps_that_were_looked_at_late_are_a_range(cheetah_buffer, monkeypatch):
+    """As on a GPU, where the sums of several steps are looked at together."""
+    model = make_model(DT, cheetah_buffer).learn(3)
+    monkeypatch.setattr(RunningMeans, "pop", lambda means: {"loss": 1.0, "grad_norm": float("inf")})
+    with pytest.raises(FloatingPointError, match=r"grad_norm became inf between gradient steps 4 and 8 .* good: none"):
+        model.learn(5, log_interval=None)
+
+
+def test_the_last_checkpoint_of_a_model_is_not_that_of_the_one_it_was_loaded_from(cheetah_buffer, tmp_path):
+    make_model(DT, cheetah_buffer).save(tmp_path / "model")
+    assert DT.load(tmp_path / "model")._last_saved is None

@@ -13,9 +13,10 @@ import torch as th
 
 import sb3_dtfm.zoo.resuming as resuming
 from sb3_dtfm import DTFM
-from sb3_dtfm.benchmark.rows import read_rows
 from sb3_dtfm.cli.main import main
 from sb3_dtfm.data import load_dataset
+from sb3_dtfm.files import replacing
+from sb3_dtfm.files.replacing import MACHINE
 from tests.recorded import DATASET_ID, tiny_training
 
 N_KILLS = 20  # of each
@@ -113,18 +114,48 @@ def test_a_killed_cache_is_built_again(workplace):
     assert th.equal(load_dataset(DATASET_ID, cache_dir="cache").rewards, expected)
 
 
-def test_rows_and_files_of_hdf5_are_whole_or_as_before(tmp_path):
-    """What is written beside takes the place at the end, and only where nothing was raised."""
-    from sb3_dtfm.files import replacing
+def test_a_file_is_whole_or_as_before(tmp_path):
+    """What is written beside takes its place at the end, and only where nothing was raised."""
 
-    path = tmp_path / "file.hdf5"
-    for value in (1, 2):
+    def write(value: int, fail: bool = False) -> None:
         with replacing(path) as beside, h5py.File(beside, "w") as file:
             file.attrs["value"] = value
-    with pytest.raises(RuntimeError), replacing(path) as beside:
-        beside.write_text("half")
-        raise RuntimeError
+            if fail:
+                raise RuntimeError
+
+    path = tmp_path / "file.hdf5"
+    write(1)
+    write(2)
+    with pytest.raises(RuntimeError):
+        write(3, fail=True)
     with h5py.File(path) as file:
         assert file.attrs["value"] == 2
     assert [each.name for each in tmp_path.iterdir()] == ["file.hdf5"]
-    assert read_rows
+
+
+def test_leftovers_of_killed_processes_alone_are_removed(tmp_path):
+    child = os.fork()
+    if child == 0:
+        os._exit(0)
+    os.waitpid(child, 0)
+    dead, alive, elsewhere = (f".file.{machine}.{process}.0a.part" for machine, process in (
+        (MACHINE, child), (MACHINE, os.getpid()), ("elsewhere", child)
+    ))  # fmt: skip
+    for name in (dead, alive, elsewhere, ".others.part"):
+        (tmp_path / name).touch()
+    with replacing(tmp_path / "new") as beside:
+        beside.touch()
+    assert {each.name for each in tmp_path.iterdir()} == {alive, elsewhere, ".others.part", "new"}
+
+
+@pytest.mark.parametrize("folder", ["read-only", "missing/parent"])
+def test_what_cannot_be_written_is_named(folder, tmp_path):
+    (tmp_path / "missing").write_text("a file where a folder would be")
+    path = tmp_path / folder / "model.zip"
+    if folder == "read-only":
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "model.zip").mkdir()  # root may write wherever it likes
+    with pytest.raises(OSError, match="model.zip") as error, replacing(path) as beside:
+        beside.touch()
+    assert error.value.filename == str(path)
+    assert not list(tmp_path.rglob("*.part"))

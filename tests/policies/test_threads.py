@@ -10,7 +10,7 @@ import pytest
 from sb3_dtfm import DT, DTFM
 from tests.conftest import TINY_FLOW_POLICY, TINY_POLICY, record_random_episodes
 
-N_THREADS = 8
+N_THREADS = 16
 
 
 @pytest.fixture
@@ -22,34 +22,36 @@ def frequent_switches():
     sys.setswitchinterval(interval)
 
 
-def roll(model, observations: np.ndarray, barrier: Barrier | None = None) -> np.ndarray:
-    """Actions along recorded observations, (T, O)."""
+def roll(model, observations: np.ndarray, barrier: Barrier | None = None) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    """Actions along the first steps of recorded observations, (T, O), and the state in the end."""
     actions, state, episode_start = [], None, np.array([True])
     if barrier is not None:
         barrier.wait()
-    for t, values in enumerate(observations):
+    for t, values in enumerate(observations[:12]):
         observation = dict(observation=values, return_to_go=np.zeros(1), timestep=np.array([t]))
         action, state = model.predict(observation, state, episode_start, deterministic=True)
         actions.append(action)
         episode_start = np.array([False])
-    return np.array(actions)
+    return np.array(actions), state
 
 
-@pytest.mark.parametrize("tokens_per_step", [3, 1])
+@pytest.mark.parametrize("options", [dict(), dict(kv_cache=True), dict(kv_cache=True, tokens_per_step=1)])
 @pytest.mark.parametrize(("algorithm", "policy_kwargs"), [(DT, TINY_POLICY), (DTFM, TINY_FLOW_POLICY)])
 def test_threads_with_their_own_states_act_as_alone_to_the_bit(
-    algorithm, policy_kwargs, tokens_per_step, cheetah_buffer, frequent_switches
+    algorithm, policy_kwargs, options, cheetah_buffer, frequent_switches
 ):
-    """With what is kept of earlier steps, over the window's slide."""
-    policy_kwargs = dict(policy_kwargs, kv_cache=True, tokens_per_step=tokens_per_step)
+    """Over the window's slide; what is kept of earlier steps, too."""
+    policy_kwargs = dict(policy_kwargs, **options)
     model = algorithm("MultiInputPolicy", dataset=cheetah_buffer, context_length=5, policy_kwargs=policy_kwargs, seed=0)
     episodes = [episode.observations for episode in record_random_episodes(N_THREADS, seed=100)]
     expected = [roll(model, observations) for observations in episodes]
+    assert all((state[-1].size > 0) == model.policy.kv_cache for _, state in expected)
     barrier = Barrier(N_THREADS)
     with ThreadPoolExecutor(N_THREADS) as pool:
-        for _ in range(2):
-            together = pool.map(lambda observations: roll(model, observations, barrier), episodes)
-            assert np.array_equal(list(together), expected)
+        together = list(pool.map(lambda observations: roll(model, observations, barrier), episodes))
+    for (actions, state), (actions_alone, state_alone) in zip(together, expected, strict=True):
+        assert np.array_equal(actions, actions_alone)
+        assert all(np.array_equal(array, alone) for array, alone in zip(state, state_alone, strict=True))
 
 
 def test_threads_that_go_on_from_one_state_act_as_alone_to_the_bit(cheetah_buffer, frequent_switches):

@@ -1,0 +1,52 @@
+"""What does not fit into memory is an error that says what to lower."""
+
+import pytest
+import torch as th
+
+from sb3_dtfm import DT
+from tests.algorithms.small import make_model
+
+NAMED = r"batch_size=(\d+), context_length=5, chunk_size=1, embed_dim=32, n_layers=2"
+
+
+def test_a_batch_larger_than_any_memory_is_named(cheetah_buffer):
+    model = make_model(DT, cheetah_buffer, batch_size=10**17)
+    with pytest.raises(MemoryError, match=f"{NAMED}.*batch_size") as caught:
+        model.learn(1)
+    assert isinstance(caught.value.__cause__, RuntimeError)
+
+
+OUT_OF_MEMORY = [
+    th.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."),
+    RuntimeError("DefaultCPUAllocator: not enough memory: you tried to allocate 8 bytes."),
+    RuntimeError("CUDA error: out of memory"),
+    MemoryError("Unable to allocate 711. PiB"),
+]
+
+
+@pytest.mark.parametrize("error", OUT_OF_MEMORY)
+def test_any_error_of_memory_is_named_and_leaves_the_weights_alone(error, cheetah_buffer, monkeypatch):
+    model = make_model(DT, cheetah_buffer).learn(1)
+    before = {name: weight.clone() for name, weight in model.policy.state_dict().items()}
+
+    def fail(*args):
+        raise error
+
+    monkeypatch.setattr(model.policy, "compute_loss", fail)
+    with pytest.raises(MemoryError, match=NAMED) as caught:
+        model.learn(1)
+    assert caught.value.__cause__ is error
+    assert all(th.equal(weight, before[name]) for name, weight in model.policy.state_dict().items())
+
+
+def test_other_errors_stay_what_they_are(cheetah_buffer, monkeypatch):
+    model = make_model(DT, cheetah_buffer)
+    error = RuntimeError("mat1 and mat2 shapes cannot be multiplied")
+
+    def fail(*args):
+        raise error
+
+    monkeypatch.setattr(model.policy, "compute_loss", fail)
+    with pytest.raises(RuntimeError) as caught:
+        model.learn(1)
+    assert caught.value is error
