@@ -250,7 +250,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
             self.score_reference = ScoreReference(*self.score_reference)
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
-        self.policy = self._make_policy(ema=self.ema_decay > 0).to(self.device)  # type: ignore[assignment]
+        self.policy = self._make_policy(ema=self.ema_decay > 0).to(self.device)
 
     def _make_policy(self, ema: bool) -> SequencePolicy:
         assert issubclass(self.policy_class, SequencePolicy)
@@ -327,8 +327,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         :param custom_objects: attributes to use in place of those in the file
         :param print_system_info: print what the file was saved with
         :param force_reset: as in SB3
-        :param allow_pickle: load files as SB3 saves them, and this package did before 0.2. That runs whatever their author
-            wanted to be run: for files that you trust
+        :param allow_pickle: load files as SB3 saves them, and this package once did. That runs whatever their author wished
+            to be run: for files that you trust
         :param kwargs: attributes to change, `dataset` for example
         :raises ModelFileError: the file is damaged, pickled, of another algorithm, or holds what no model can have
         :raises ValueError: an attribute out of range, or an environment that does not fit
@@ -384,7 +384,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         with th.device("meta"):
             check_policy(self._make_policy(ema=False), tensors, source)
 
-    def _parameters(self, tensors: dict[str, dict[str, th.Tensor]], source: str) -> dict[str, dict[str, Any]]:
+    def _parameters(self, tensors: dict[str, dict[str, th.Tensor]], source: str) -> Any:
         """What :meth:`set_parameters` takes, from the tensors of a file."""
         optimizer = optimizer_state(self.policy.optimizer, tensors[OPTIMIZER], source)
         return {POLICY: tensors[POLICY], OPTIMIZER: optimizer}

@@ -192,6 +192,10 @@ def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
     """What is not checked as arguments are."""
     if not isinstance(attributes.get("policy_kwargs", {}), dict):
         raise ModelFileError(f"{source}: policy_kwargs are {attributes['policy_kwargs']!r}, expected arguments by name.")
+    reference = attributes.get("score_reference")
+    kinds = [type(each) for each in reference] if isinstance(reference, list) else reference
+    if kinds not in (None, [float, float, str]) or (reference and not reference[0] < reference[1]):
+        raise ModelFileError(f"{source}: score_reference is {reference}, expected two returns and where they come from.")
     with naming_the_file(source):
         check_arguments({**dict.fromkeys(COUNTERS, 1), **attributes}, COUNTERS)  # one may have been left out
     observation, action = attributes["observation_space"], attributes["action_space"]
@@ -223,7 +227,7 @@ def _to_learning_rate(saved: Any, source: str) -> Any:
 
 
 def _to_means(saved: dict[str, Any], source: str) -> RunningMeans:
-    n_values, sums = saved.get("n_values"), saved.get("sums")
+    n_values, sums = saved.get("n_values", -1), saved.get("sums")
     numbers = sums.values() if isinstance(sums, dict) else [None]
     if not WHOLE.accepts(n_values) or not all(map(Number().accepts, numbers)) or bool(n_values) != bool(sums):
         raise ModelFileError(f"{source}: means are {saved}, expected sums of a number of values.")

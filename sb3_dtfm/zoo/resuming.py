@@ -176,4 +176,4 @@ def _take_up_evaluations(callback: EvalCallback, path: Path, num_timesteps: int)
     callback.evaluations_timesteps = kept["timesteps"]
     callback.evaluations_results, callback.evaluations_length = kept["results"], kept["ep_lengths"]
     callback.evaluations_successes = kept.get("successes", [])
-    callback.best_mean_reward = max(map(np.mean, kept["results"]), default=-np.inf)
+    callback.best_mean_reward = float(max(map(np.mean, kept["results"]), default=-np.inf))

@@ -155,7 +155,7 @@ def test_what_cannot_be_written_is_named(folder, tmp_path):
     if folder == "read-only":
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "model.zip").mkdir()  # root may write wherever it likes
-    with pytest.raises(OSError, match="model.zip") as error, replacing(path) as beside:
+    with pytest.raises(OSError, match=r"model\.zip") as error, replacing(path) as beside:
         beside.touch()
     assert error.value.filename == str(path)
     assert not list(tmp_path.rglob("*.part"))

@@ -233,6 +233,8 @@ BAD_CONFIGURATIONS = [
     (("attributes", "policy_kwargs", "solver"), "nonsense", "solver must be"),
     (("attributes", "policy_kwargs", "n_solver_steps"), 10**12, "n_solver_steps must be"),
     (("attributes", "policy_kwargs", "unheard_of"), 1, "unheard_of is unknown"),
+    (("attributes", "score_reference"), "abc", "score_reference is abc"),
+    (("attributes", "score_reference"), [2.0, 1.0, "x"], "score_reference is [2.0"),
     (("attributes", "policy_kwargs"), 7, "policy_kwargs"),
     (("members",), {}, "does not describe the members"),
     (("members", "../evil.safetensors"), {"bytes": 1}, "does not describe the members"),
