@@ -174,7 +174,7 @@ def from_configuration(
     attributes["learning_rate"] = _to_learning_rate(taken("learning_rate", (int, float, str, dict)), source)
     if "policy_class" not in custom_objects:
         attributes["policy_class"] = _policy_class(algorithm, taken("policy_class", str), source)
-    attributes.update(custom_objects)
+    attributes.update({name: each for name, each in custom_objects.items() if name in {*attributes, *ENCODED}})
     _check_attributes(attributes, source)
     return attributes
 

@@ -9,12 +9,14 @@ from sb3_dtfm.files.model import (
     read_model,
     write_model,
 )
-from sb3_dtfm.files.replacing import replacing
+from sb3_dtfm.files.replacing import find_leftovers, hidden_name, replacing
 
 __all__ = [
     "ModelFile",
     "ModelFileError",
     "file_name",
+    "find_leftovers",
+    "hidden_name",
     "holds_pickles",
     "read_configuration",
     "read_model",

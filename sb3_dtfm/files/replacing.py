@@ -28,10 +28,12 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     if target.exists() and not target.is_file() and not target.is_dir():  # a device or a pipe
         yield target
         return
-    beside = target.with_name(f".{target.name}.{MACHINE}.{os.getpid()}.{secrets.token_hex(4)}.part")
+    beside = target.with_name(hidden_name(target.name))
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        remove_leftovers(target.parent)
+        for leftover in find_leftovers(target.parent):
+            if leftover.is_file():
+                leftover.unlink(missing_ok=True)
         beside.touch(exist_ok=False)
         try:
             yield beside
@@ -48,16 +50,25 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
-def remove_leftovers(folder: Path) -> None:
+def hidden_name(name: str) -> str:
     """
-    Remove what processes of this machine were writing when they were killed.
+    A name for what is not complete yet, which tells who is writing it.
+
+    :param name: that it will have
+    """
+    return f".{name}.{MACHINE}.{os.getpid()}.{secrets.token_hex(4)}.part"
+
+
+def find_leftovers(folder: Path) -> list[Path]:
+    """
+    What processes of this machine were writing when they were killed.
 
     :param folder: where files are replaced
     """
-    for path in folder.glob(".*.part"):
-        named = LEFTOVER.fullmatch(path.name)
-        if named and named["machine"] == MACHINE and not _may_be_alive(int(named["process"])):
-            path.unlink(missing_ok=True)
+    found = ((path, LEFTOVER.fullmatch(path.name)) for path in folder.glob(".*.part"))
+    return [
+        path for path, named in found if named and named["machine"] == MACHINE and not _may_be_alive(int(named["process"]))
+    ]
 
 
 def _may_be_alive(process: int) -> bool:

@@ -1,7 +1,8 @@
 """Writes recorded episodes as a Minari dataset."""
 
+import errno
+import os
 import shutil
-import tempfile
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,7 +19,13 @@ from minari.namespace import create_namespace, list_local_namespaces
 from minari.storage import get_dataset_path
 
 from sb3_dtfm.data.trajectories import DatasetError
+from sb3_dtfm.files import find_leftovers, hidden_name
 from sb3_dtfm.recording.episodes import RecordedEpisode, stack_observations
+
+# A dataset that is being replaced, in the hidden folder of the new one.
+OLD = "old"
+# Bytes that HDF5 and the metadata may need beside the episodes.
+SPARE = 2**20
 
 
 def check_dataset_id(dataset_id: str, overwrite: bool) -> None:
@@ -49,24 +56,60 @@ def write_minari(
     """
     target = get_dataset_path(dataset_id)
     namespace = parse_dataset_id(dataset_id)[0]
-    staging = Path(tempfile.mkdtemp(prefix=".recording-", dir=get_dataset_path()))
+    _clear_up(get_dataset_path(), target)
+    staging = get_dataset_path() / hidden_name(_plain(target))
+    staging.mkdir()
     try:
         (staging / "new").mkdir()
         storage = MinariStorage.new(staging / "new" / "data", env.observation_space, env.action_space, _storable_spec(env))
         storage.update_metadata({"dataset_id": dataset_id, "minari_version": minari.__version__})
         returns = []
         for episode in episodes:
-            storage.update_episodes([_episode_buffer(episode)])
+            buffer = _episode_buffer(episode)
+            _check_space(staging, buffer)
+            storage.update_episodes([buffer])
             returns.append(np.sum(episode.rewards))
         storage.update_metadata({**metadata, "ref_max_score": float(np.mean(returns))})
         if namespace is not None and namespace not in list_local_namespaces():
             create_namespace(namespace)
         if target.exists():
-            target.rename(staging / "old")
+            target.rename(staging / OLD)
         (staging / "new").rename(target)
     finally:
         shutil.rmtree(staging, ignore_errors=True)
     return minari.MinariDataset(target / "data")
+
+
+def _plain(target: Path) -> str:
+    return "-".join(target.relative_to(get_dataset_path()).parts)
+
+
+def _clear_up(folder: Path, target: Path) -> None:
+    """Remove what killed recordings left; a dataset that one had moved away to replace it comes back."""
+    for leftover in find_leftovers(folder):
+        if (leftover / OLD).exists():
+            if not leftover.name.startswith(f".{_plain(target)}."):
+                continue
+            if not target.exists():
+                (leftover / OLD).rename(target)
+        shutil.rmtree(leftover, ignore_errors=True)
+
+
+def _check_space(folder: Path, episode: EpisodeBuffer) -> None:
+    """
+    HDF5 ends in a segmentation fault where the disk is full: leave before.
+
+    :raises OSError: an episode may not fit
+    """
+    needed = 2 * sum(map(_n_bytes, (episode.observations, episode.actions, episode.rewards))) + SPARE
+    if shutil.disk_usage(folder).free < needed:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder.parent))
+
+
+def _n_bytes(observations: Any) -> int:
+    if isinstance(observations, dict):
+        return sum(map(_n_bytes, observations.values()))
+    return np.asarray(observations).nbytes
 
 
 def _episode_buffer(episode: RecordedEpisode) -> EpisodeBuffer:

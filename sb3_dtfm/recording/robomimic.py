@@ -29,20 +29,23 @@ def write_robomimic(
     path: str | os.PathLike[str], episodes: Iterable[RecordedEpisode], env_args: dict[str, Any], seed: int = 0
 ) -> None:
     """
-    Write episodes as they come into a hidden file, which takes its name when it is complete.
+    Write episodes into a file, which appears when it is complete.
 
     :param path: the file, which is replaced if it is there; its folder is made if necessary
     :param episodes: with dicts of observations, simulator states and the scene
     :param env_args: description of the environment, stored as JSON
     :param seed: of the filter keys `train`, `valid` (a tenth) and `50_percent`
     """
-    with replacing(path) as beside, h5py.File(beside, "w") as file:
+    # In memory first: HDF5 ends in a segmentation fault where the disk is full.
+    with replacing(path) as beside, h5py.File(beside, "w", driver="core", backing_store=False) as file:
         data = file.create_group("data")
         lengths = [_write_demo(data, f"demo_{number}", episode) for number, episode in enumerate(episodes)]
         data.attrs["total"] = sum(lengths)
         data.attrs["env_args"] = json.dumps(env_args, indent=4)
         for key, chosen in _filter_keys(len(lengths), seed).items():
             file[f"mask/{key}"] = np.array([f"demo_{number}" for number in np.sort(chosen)], dtype="S")
+        file.flush()
+        beside.write_bytes(file.id.get_file_image())
 
 
 def _write_demo(data: h5py.Group, name: str, episode: RecordedEpisode) -> int:

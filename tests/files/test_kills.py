@@ -1,7 +1,9 @@
 """Killed at any moment: whatever a training, a recording or a cache leaves behind under its own name can be loaded."""
 
 import os
+import resource
 import signal
+import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +19,8 @@ from sb3_dtfm.cli.main import main
 from sb3_dtfm.data import load_dataset
 from sb3_dtfm.files import replacing
 from sb3_dtfm.files.replacing import MACHINE
+from sb3_dtfm.recording.demonstrations import record_demonstrations
+from tests.algorithms.small import make_model
 from tests.recorded import DATASET_ID, tiny_training
 
 N_KILLS = 20  # of each
@@ -96,22 +100,29 @@ def test_a_killed_recording_leaves_the_one_before(workplace, minari_folder):
 
     kill_often(lambda: main([*record, "--episodes", "2", "--n-envs", "2"]), check, seed=1)
     assert load_dataset(name).n_episodes == 2
-    assert not [path for path in minari_folder.iterdir() if path.name.startswith(".recording-")]
+    assert not list(minari_folder.glob(".*.part"))
 
 
 @pytest.mark.slow
 def test_a_killed_cache_is_built_again(workplace):
-    """Also one that takes the place of an outdated one."""
-    expected = load_dataset(DATASET_ID).rewards
-    seeds = iter(range(10**6))
+    """Also one that takes the place of an outdated one: the dataset is written anew before each."""
+    random = np.random.default_rng(0)
+    n_steps = 300_000
+    steps = {name: random.uniform(-1, 1, (n_steps, *shape)) for name, shape in (("observations", (17,)), ("actions", (3,)))}
+    lengths = np.full(n_steps // 1000, 1000)
+    np.savez("data.npz", **steps, rewards=np.arange(n_steps), episode_lengths=lengths)
 
     def build() -> None:
-        for path in Path("cache").rglob("*.json"):
-            os.utime(path, ns=(0, next(seeds)))
-        load_dataset(DATASET_ID, cache_dir="cache")
+        os.utime("data.npz")
+        load_dataset("data.npz", cache_dir="cache")
 
-    kill_often(build, lambda: None, seed=2)
-    assert th.equal(load_dataset(DATASET_ID, cache_dir="cache").rewards, expected)
+    def check() -> None:
+        if random.uniform() < 0.3:
+            assert load_dataset("data.npz", cache_dir="cache").rewards[-1] == n_steps - 1
+
+    kill_often(build, check, seed=2)
+    assert load_dataset("data.npz", cache_dir="cache").rewards[-1] == n_steps - 1
+    assert len([path for path in Path("cache").iterdir() if path.is_dir()]) == 1
 
 
 def test_a_file_is_whole_or_as_before(tmp_path):
@@ -146,6 +157,71 @@ def test_leftovers_of_killed_processes_alone_are_removed(tmp_path):
     with replacing(tmp_path / "new") as beside:
         beside.touch()
     assert {each.name for each in tmp_path.iterdir()} == {alive, elsewhere, ".others.part", "new"}
+
+
+def on_a_full_disk(size: int, work: Callable[[], object]) -> str:
+    """What a process of its own raises that may write files of this many bytes, and no longer ones."""
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+        try:
+            work()
+        except Exception as error:
+            os.write(writing, f"{type(error).__name__}: {error}".encode())
+        os._exit(0)
+    os.close(writing)
+    with open(reading) as said:
+        text = said.read()
+    assert os.waitpid(child, 0)[1] == 0
+    return text
+
+
+@pytest.mark.parametrize("size", [1_000, 100_000])
+def test_a_full_disk_is_one_line_with_the_path_and_loses_nothing(size, cheetah_buffer, tmp_path):
+    model = make_model(DTFM, cheetah_buffer)
+    writers: dict[str, Callable[[Path], object]] = {
+        "model.zip": model.save,
+        "lift.hdf5": lambda path: record_demonstrations("lift", 2, path, n_workers=1, overwrite=True, progress=False),
+    }
+    for name, write in writers.items():
+        write(tmp_path / name)
+        before = (tmp_path / name).read_bytes()
+        said = on_a_full_disk(size, lambda write=write, name=name: write(tmp_path / name))
+        assert said == f"OSError: [Errno 27] File too large: '{tmp_path / name}'"
+        assert (tmp_path / name).read_bytes() == before
+    assert {path.name for path in tmp_path.iterdir()} == writers.keys()
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of its own with two megabytes."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(folder)], capture_output=True).returncode:
+        pytest.skip("mounting a file system takes the rights of root")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_recording_leaves_a_full_disk_before_hdf5_breaks(small_disk, minari_folder, monkeypatch, capsys):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(small_disk))
+    record = [
+        "record",
+        "--algo",
+        "ppo",
+        "--model",
+        str(minari_folder / "agent.zip"),
+        "--env",
+        "HalfCheetah-v5",
+        "--n-envs",
+        "2",
+    ]
+    assert main([*record, "--dataset-id", "tests/full-v0", "--episodes", "2"]) == 0
+    assert main([*record, "--dataset-id", "tests/full-v0", "--episodes", "8", "--overwrite"]) == 2
+    assert f"{small_disk}: No space left on device" in capsys.readouterr().err
+    assert load_dataset("tests/full-v0").n_episodes == 2
+    assert not list(small_disk.glob(".*"))
 
 
 @pytest.mark.parametrize("folder", ["read-only", "missing/parent"])

@@ -156,6 +156,14 @@ def test_a_policy_of_ones_own_is_asked_for(cheetah_buffer, tmp_path):
     assert isinstance(DT.load(tmp_path / "model", custom_objects={"policy_class": OwnPolicy}).policy, OwnPolicy)
 
 
+def test_custom_objects_take_the_place_of_what_is_in_the_file_alone(saved):
+    loaded = DTFM.load(
+        io.BytesIO(saved), custom_objects={"learning_rate": 0.0, "lr_schedule": lambda _: 1.0, "clip_range": 1}
+    )
+    assert loaded.lr_schedule(1.0) == 0.0
+    assert not hasattr(loaded, "clip_range")
+
+
 def test_a_pickled_model_runs_nothing_unless_it_is_trusted(saved, tmp_path):
     """Every attribute of a file of Stable-Baselines3 can hold code, and its own loader runs it."""
     RAN.clear()
