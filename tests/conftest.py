@@ -14,9 +14,13 @@ TINY_FLOW_POLICY = dict(TINY_POLICY, flow_hidden_dim=32, flow_n_layers=2, n_solv
 EPISODE_LENGTH = 30
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope="session")
 def one_thread():
-    """Tests share the cores with one another; threads that wait for each other would make them slow."""
+    """
+    Tests share the cores with one another; threads that wait for each other would make them slow.
+
+    Before any other fixture: another number of threads adds up in another order, to other bits.
+    """
     th.set_num_threads(1)
 
 

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,12 @@ def what_was_learned() -> tuple[th.Tensor, th.Tensor, dict, dict]:
     return weights(RUN / "HalfCheetah-v5.zip"), weights(RUN / "best_model.zip"), curves(), evaluations()
 
 
+def resume(*arguments: str) -> int:
+    """In the next second: files of events are read in the order of their names, which begin with the second."""
+    time.sleep(1.0 - time.time() % 1.0)
+    return main(["train", "--resume", str(RUN), *arguments])
+
+
 def assert_same(ours, theirs):
     for one, other in zip(ours[:2], theirs[:2], strict=True):
         assert th.equal(one, other)
@@ -96,11 +103,11 @@ def test_an_interrupted_run_goes_on_in_its_folder_to_the_bit(number, code, strai
     assert f"--resume {RUN}" in capsys.readouterr().out
     assert DTFM.load(RUN / CHECKPOINT).num_timesteps == SIGNAL_AT + 1
     assert DTFM.load(RUN / "HalfCheetah-v5.zip").num_timesteps == SIGNAL_AT + 1
-    assert main(["train", "--resume", str(RUN)]) == 0
+    assert resume() == 0
     assert_same(what_was_learned(), straight)
     assert not (RUN / CHECKPOINT).exists()
     assert [path.name for path in Path("logs/dtfm").iterdir()] == [RUN.name]
-    assert main(["train", "--resume", str(RUN)]) == 2
+    assert resume() == 2
     assert "the run is finished" in capsys.readouterr().err
 
 
@@ -120,7 +127,7 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint_or_from_the_start(interva
     assert killed.returncode == -signal.SIGKILL
     assert (RUN / START).is_file()
     assert (RUN / CHECKPOINT).is_file() == (interval == 0.0)
-    assert main(["train", "--resume", str(RUN), *training()[1:]]) == 0
+    assert resume(*training()[1:]) == 0
     assert_same(what_was_learned(), straight)
 
 
@@ -128,7 +135,7 @@ def test_a_run_without_a_seed_goes_on_with_the_one_that_was_drawn(workplace):
     arguments = [argument for argument in training((SIGNAL_AT, signal.SIGINT)) if argument not in ("--seed", "3")]
     assert main(arguments) == 0
     seed = DTFM.load(RUN / CHECKPOINT).seed
-    assert main(["train", "--resume", str(RUN)]) == 0
+    assert resume() == 0
     model = DTFM.load(RUN / "HalfCheetah-v5.zip")
     assert (model.seed, model.num_timesteps) == (seed, N_STEPS)
 
