@@ -24,6 +24,7 @@ from tests.algorithms.small import make_model
 from tests.recorded import DATASET_ID, tiny_training
 
 N_KILLS = 20  # of each
+NOBODY = 65534  # a user without rights
 RUN = Path("logs/dtfm/HalfCheetah-v5_1")
 
 
@@ -160,11 +161,20 @@ def test_leftovers_of_killed_processes_alone_are_removed(tmp_path):
 
 
 def on_a_full_disk(size: int, work: Callable[[], object]) -> str:
-    """What a process of its own raises that may write files of this many bytes, and no longer ones."""
+    """What work raises that may write files of this many bytes, and no longer ones."""
+
+    def limited() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+        work()
+
+    return said_by(limited)
+
+
+def said_by(work: Callable[[], object]) -> str:
+    """What work raises in a process of its own."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
         try:
             work()
         except Exception as error:
@@ -224,14 +234,39 @@ def test_a_recording_leaves_a_full_disk_before_hdf5_breaks(small_disk, minari_fo
     assert not list(small_disk.glob(".*"))
 
 
-@pytest.mark.parametrize("folder", ["read-only", "missing/parent"])
+@pytest.mark.parametrize("folder", ["a folder of that name", "missing/parent"])
 def test_what_cannot_be_written_is_named(folder, tmp_path):
     (tmp_path / "missing").write_text("a file where a folder would be")
     path = tmp_path / folder / "model.zip"
-    if folder == "read-only":
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "model.zip").mkdir()  # root may write wherever it likes
+    if folder == "a folder of that name":
+        path.mkdir(parents=True)
     with pytest.raises(OSError, match=r"model\.zip") as error, replacing(path) as beside:
         beside.touch()
     assert error.value.filename == str(path)
     assert not list(tmp_path.rglob("*.part"))
+
+
+@pytest.mark.parametrize("name", ["model.zip", "lift.hdf5"])
+def test_a_read_only_folder_is_one_line_with_the_path(name, cheetah_buffer, tmp_path):
+    """As a user without root's rights."""
+    folder = tmp_path / "shared"
+    folder.mkdir()
+    path = folder / name
+    path.write_text("what was there before")
+    folder.chmod(0o555)
+    for each in (tmp_path, tmp_path.parent, tmp_path.parent.parent):
+        each.chmod(each.stat().st_mode | 0o055)
+    model = make_model(DTFM, cheetah_buffer)
+
+    def write() -> None:
+        if os.geteuid() == 0:
+            os.setgid(NOBODY)
+            os.setuid(NOBODY)
+        if name == "model.zip":
+            model.save(path)
+        else:
+            record_demonstrations("lift", 2, path, n_workers=1, overwrite=True, progress=False)
+
+    assert said_by(write) == f"PermissionError: [Errno 13] Permission denied: '{path}'"
+    assert path.read_text() == "what was there before"
+    assert list(folder.iterdir()) == [path]
