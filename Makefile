@@ -1,5 +1,5 @@
 .DELETE_ON_ERROR:
-.PHONY: help install demo test bench format lint type clean
+.PHONY: help install demo test test-all bench format lint type clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -13,6 +13,7 @@ help:
 	@echo "make install  pinned environment in $(VENV), for Python 3.10 to 3.12"
 	@echo "make demo     record, train and evaluate on robosuite's Lift: 5 minutes on 2 cores"
 	@echo "make test     the fast tests"
+	@echo "make test-all the slow tests too: kills, a million calls, several processes; half an hour on 2 cores"
 	@echo "make bench    DT and DTFM beside d3rlpy, training and acting: 15 minutes on 2 idle cores"
 	@echo "make format   rewrite the sources in the project's format"
 	@echo "make lint     check format and style"
@@ -50,6 +51,9 @@ demo: install
 
 test: install
 	$(BIN)/python -m pytest -n 2 --durations=10
+
+test-all: install
+	$(BIN)/python -m pytest -n 2 --durations=20 -m "slow or not slow"
 
 bench: install $(PEERS)/installed
 	$(BIN)/python studies/compare.py --peer-python $(PEERS)/bin/python

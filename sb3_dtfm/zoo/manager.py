@@ -105,11 +105,11 @@ class OfflineExperimentManager(ExperimentManager):
         :raises SystemExit: SIGTERM has ended the run
         """
         super().save_trained_model(model)
-        interrupted = self.signals.asked and model.num_timesteps < model._total_timesteps
+        interrupted = self.keeper is not None and not self.keeper.ended
         if self.keeper is not None and not interrupted:
             self.keeper.remove()
         elif self.keeper is not None:
-            if not self.signals.at_once:  # in the midst of a step
+            if self.signals.asked and not self.signals.at_once:  # else in the midst of a step
                 self.keeper.save()
             print(f"Interrupted after {model.num_timesteps} steps; sb3-dtfm train --resume {self.save_path} goes on.")
         if interrupted and self.signals.terminated:

@@ -115,6 +115,7 @@ class KeepCheckpoint(BaseCallback):
         self.path = run / CHECKPOINT
         self.signals = signals
         self.start = start
+        self.ended = False  # training has, by itself
         self._saved_at = 0.0
         self._ending = False
 
@@ -129,6 +130,9 @@ class KeepCheckpoint(BaseCallback):
         if time.monotonic() - self._saved_at >= CHECKPOINT_INTERVAL:
             self.save()
         return True
+
+    def _on_training_end(self) -> None:
+        self.ended = True
 
     def save(self) -> None:
         """Save the model as it is."""

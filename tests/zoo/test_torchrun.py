@@ -10,18 +10,37 @@ from pathlib import Path
 import numpy as np
 import optuna
 import pytest
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.cli.main import main
+from sb3_dtfm.zoo.resuming import CHECKPOINT
 from tests.recorded import DATASET_ID, tiny_training
 
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "sb3_dtfm"]
 LIMIT = 180  # seconds after which processes that wait for each other are taken as hanging
 
 
+class CheckpointThenSignal(BaseCallback):
+    """Saves a checkpoint at step 20, and at step 33 interrupts torchrun, or kills this process of two."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == 20:
+            self.model.save(Path("logs", "dtfm", "HalfCheetah-v5_1", CHECKPOINT))
+        if self.num_timesteps == 33:
+            os.kill(os.getppid() if self.number == signal.SIGINT else os.getpid(), self.number)
+        return True
+
+
 def start(*command: str, **kwargs) -> subprocess.Popen:
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, **pipes, **kwargs)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[2])}
+    return subprocess.Popen(command, env=environment, **pipes, **kwargs)
 
 
 def wait_for(path: Path) -> None:
@@ -70,6 +89,29 @@ def test_an_interrupt_saves_the_model_and_ends_all(workplace):
     process.communicate(timeout=LIMIT)
     assert process.returncode != 0
     assert DT.load(run / "HalfCheetah-v5.zip").num_timesteps >= 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_training_of_two_processes_goes_on_to_the_bit(number, workplace):
+    settings = ["--conf-file", "small", "--eval-freq", "-1", "--seed", "3", "-n", "60", "--dataset", DATASET_ID]
+    straight = start(*TORCHRUN, *tiny_training("dtfm", *settings, "-f", "straight"))
+    assert straight.wait(LIMIT) == 0
+    signals = [{"tests.zoo.test_torchrun.CheckpointThenSignal": {"number": int(number)}}]
+    interrupted = start(*TORCHRUN, *tiny_training("dtfm", f"callback:{signals!r}", *settings))
+    _, errors = interrupted.communicate(timeout=LIMIT)
+    assert interrupted.returncode != 0
+    run = workplace / "logs" / "dtfm" / "HalfCheetah-v5_1"
+    assert DTFM.load(run / CHECKPOINT).num_timesteps == 20, errors
+    resumed = start(*TORCHRUN, "train", "--resume", str(run), *tiny_training("dtfm", *settings)[1:])
+    _, errors = resumed.communicate(timeout=LIMIT)
+    assert resumed.returncode == 0, errors
+    ours, theirs = (
+        DTFM.load(folder / "dtfm" / "HalfCheetah-v5_1" / "HalfCheetah-v5.zip").policy.state_dict()
+        for folder in (workplace / "logs", workplace / "straight")
+    )
+    for name, values in theirs.items():
+        assert th.equal(ours[name], values), name
 
 
 @pytest.mark.slow
