@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import EvalCallback
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.distributed import is_first_process
-from sb3_dtfm.zoo.resuming import CHECKPOINT, KeepCheckpoint, Start, StopSignals, go_on
+from sb3_dtfm.zoo.resuming import CHECKPOINT, KeepCheckpoint, ReplaceEvaluations, Start, StopSignals, go_on
 
 
 class TrainingError(RuntimeError):
@@ -73,7 +73,7 @@ class OfflineExperimentManager(ExperimentManager):
         first = self.callbacks.index(evaluations[0]) if evaluations else 0
         self.callbacks.insert(first, SeedEvaluations(evaluations, self.seed))
         self.keeper = KeepCheckpoint(Path(self.save_path), self.signals, self.start)
-        self.callbacks += [EvaluateAtStartAndEnd(evaluations), self.keeper]
+        self.callbacks += [EvaluateAtStartAndEnd(evaluations), ReplaceEvaluations(evaluations), self.keeper]
 
     def learn(self, model: BaseAlgorithm) -> None:
         """

@@ -145,6 +145,46 @@ class KeepCheckpoint(BaseCallback):
         (self.path.parent / START).unlink(missing_ok=True)
 
 
+class ReplaceEvaluations(BaseCallback):
+    """
+    Have `evaluations.npz` replaced when it is whole, where `EvalCallback` writes over it. Put it behind the evaluations.
+
+    :param eval_callbacks: the evaluations, which from now on write a hidden file beside it
+    """
+
+    def __init__(self, eval_callbacks: Sequence[EvalCallback]) -> None:
+        super().__init__()
+        self.files = []
+        for evaluation in eval_callbacks:
+            if evaluation.log_path is not None:
+                whole = _evaluations(evaluation)
+                beside = whole.with_name(f".{whole.name}")
+                self.files.append((beside, whole))
+                evaluation.log_path = str(beside.with_suffix(""))  # NumPy adds it
+
+    def _on_training_start(self) -> None:
+        self._replace()
+
+    def _on_step(self) -> bool:
+        self._replace()
+        return True
+
+    def _on_training_end(self) -> None:
+        self._replace()
+
+    def _replace(self) -> None:
+        for beside, whole in self.files:
+            if beside.exists():
+                with replacing(whole) as path:
+                    path.write_bytes(beside.read_bytes())
+                beside.unlink()
+
+
+def _evaluations(callback: EvalCallback) -> Path:
+    """The file of an evaluation that has one."""
+    return Path(str(callback.log_path)).with_name("evaluations.npz")
+
+
 def go_on(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], start: Start) -> None:
     """
     Have logs and evaluations of a run follow those that there are, as far as the checkpoint.
@@ -159,7 +199,7 @@ def go_on(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], start: Start)
         if isinstance(callback, EvaluateAtStartAndEnd):
             callback.go_on(n_steps)
         elif isinstance(callback, EvalCallback) and callback.log_path is not None:
-            _take_up_evaluations(callback, Path(f"{callback.log_path}.npz"), n_steps)
+            _take_up_evaluations(callback, _evaluations(callback), n_steps)
     if start.tensorboard is not None:
         logger = configure(start.tensorboard, ["stdout", "tensorboard"] if model.verbose else ["tensorboard"])
         for output in logger.output_formats:
@@ -175,7 +215,7 @@ def _take_up_evaluations(callback: EvalCallback, path: Path, num_timesteps: int)
     try:
         with np.load(path, allow_pickle=False) as saved:
             kept = {name: saved[name][saved["timesteps"] <= num_timesteps].tolist() for name in saved.files}
-    except (OSError, ValueError, KeyError, EOFError):  # none yet, or cut off by the kill
+    except (OSError, ValueError, KeyError, EOFError):  # none yet, or damaged
         return
     callback.evaluations_timesteps = kept["timesteps"]
     callback.evaluations_results, callback.evaluations_length = kept["results"], kept["ep_lengths"]

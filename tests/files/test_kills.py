@@ -83,6 +83,9 @@ def test_a_killed_training_leaves_models_that_load(workplace, monkeypatch):
             DTFM.load(path)
         for path in Path("logs").rglob("*.json"):
             resuming.Start.read(path.parent)
+        for path in Path("logs").rglob("evaluations.npz"):
+            with np.load(path) as evaluations:
+                assert len(evaluations["results"]) == len(evaluations["timesteps"])
 
     kill_often(train, check, seed=0)
     assert not list(RUN.glob(".*.part"))
