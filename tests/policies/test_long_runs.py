@@ -12,7 +12,7 @@ from sb3_dtfm import DT
 from tests.algorithms.small import make_model
 
 RESIDENT_PAGES = Path("/proc/self/statm")
-SMALLEST = dict(embed_dim=8, n_layers=1, n_heads=1)
+SMALLEST = dict(embed_dim=8, n_layers=1, n_heads=1, tokens_per_step=1)
 LENGTHS = np.array([[50], [70]])  # of the two rows' episodes
 MOST_BLOCKS, MOST_BYTES = 300, 2**22
 
