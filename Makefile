@@ -1,11 +1,15 @@
 .DELETE_ON_ERROR:
-.PHONY: help install demo test test-all bench format lint type clean
+.PHONY: help install demo test test-all bench lowest highest audit licences format lint type clean
 
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 # d3rlpy needs another gymnasium.
 PEERS := .venv-peers
+# What looks at dependencies, apart from them.
+TOOLS := .venv-tools
+# Tests of each part that meets other packages.
+SMOKE := tests/cli/test_command_line.py tests/data/test_minari.py tests/envs/robosuite/test_env.py tests/files/test_model.py
 # What is checked and formatted besides the package.
 SOURCES := sb3_dtfm envs zoo_configs tests studies
 
@@ -15,6 +19,9 @@ help:
 	@echo "make test     the fast tests"
 	@echo "make test-all the slow tests too: kills, a million calls, several processes; half an hour on 2 cores"
 	@echo "make bench    DT and DTFM beside d3rlpy, training and acting: 15 minutes on 2 idle cores"
+	@echo "make lowest   tests of each part with the lowest versions that pyproject.toml allows; make highest: the highest"
+	@echo "make audit    ask for known vulnerabilities of the pinned versions; needs the network"
+	@echo "make licences write the table of docs/licences.md anew"
 	@echo "make format   rewrite the sources in the project's format"
 	@echo "make lint     check format and style"
 	@echo "make type     check types"
@@ -41,7 +48,7 @@ $(STAMP): pyproject.toml constraints.txt
 	$$python -m venv $(VENV)
 	@$(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt -e ".[all,dev]" || { \
 		echo "The installation failed. robosuite needs evdev, which pip builds: that takes a C compiler, Python's headers" >&2; \
-		echo "(python3-dev) and the kernel's (linux-libc-dev)." >&2; \
+		echo "(python3-dev) and the kernel's (linux-libc-dev). docs/guide.md, 'Without a compiler', installs without it." >&2; \
 		exit 1; \
 	}
 	@touch $@
@@ -64,6 +71,30 @@ $(PEERS)/installed: constraints.txt
 	$(PEERS)/bin/pip install --disable-pip-version-check --quiet $$(grep '^torch==' constraints.txt) d3rlpy==2.8.1
 	@touch $@
 
+lowest: RESOLUTION := lowest-direct
+highest: RESOLUTION := highest
+lowest highest: install $(TOOLS)/installed
+	rm -rf .venv-$@
+	$(BIN)/python -m venv .venv-$@
+	$(TOOLS)/bin/uv pip install --python .venv-$@/bin/python --resolution $(RESOLUTION) -e ".[all,dev]"
+	.venv-$@/bin/python -m pytest -n 2 $(SMOKE)
+
+# Strict: a package that the service does not know is an error, not a clean one.
+audit: install $(TOOLS)/installed
+	$(TOOLS)/bin/pip-audit --strict --disable-pip --no-deps -r constraints.txt
+
+# Of the pinned packages alone: CUDA's, which PyTorch brings on some platforms, are left to the page's text.
+licences: install $(TOOLS)/installed
+	sed -i '/^| Name/,$$d' docs/licences.md
+	$(TOOLS)/bin/pip-licenses --python $(BIN)/python --from=mixed --with-system --format=markdown \
+		--packages $$(sed '/^#/d; s/==.*//' constraints.txt | sort -u) | sed 's/  *|/ |/g; s/----*/---/g' >> docs/licences.md
+
+$(TOOLS)/installed: Makefile | install
+	rm -rf $(TOOLS)
+	$(BIN)/python -m venv $(TOOLS)
+	$(TOOLS)/bin/pip install --disable-pip-version-check --quiet pip-audit==2.10.1 pip-licenses==5.5.5 uv==0.13.9
+	@touch $@
+
 format: install
 	$(BIN)/ruff format $(SOURCES)
 	$(BIN)/ruff check --fix $(SOURCES)
@@ -80,4 +111,4 @@ type: install
 	cd build/typing && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache
 
 clean:
-	rm -rf $(VENV) $(PEERS) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(PEERS) $(TOOLS) .venv-lowest .venv-highest build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache

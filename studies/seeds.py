@@ -1,8 +1,8 @@
 """
 The final evaluations of a study as a picture: a dot for each seed, their mean, and its 95 % interval (Student's t).
 
-    python studies/seeds.py results/adroit docs/studies/adroit.png --label adroit
-    python studies/seeds.py results/chunks docs/studies/few.png --label chunks
+    python studies/seeds.py results/adroit docs/studies/adroit.png --labels "" adroit
+    python studies/seeds.py results/chunks docs/studies/few.png --labels chunks --below demonstrations
 """
 
 import argparse
@@ -20,17 +20,17 @@ from sb3_dtfm.benchmark.report.statistics import student_t
 Cells = dict[tuple[str, str], list[Run]]  # by what stands below, and the algorithm
 
 
-def read(folder: Path, label: str) -> Cells:
-    """The runs of one label, by task or, where there is one task only, by the number of episodes learned from."""
-    groups = [group for study in read_studies([folder]) for group in study.groups if group.label == label]
+def read(folder: Path, labels: list[str]) -> Cells:
+    """The runs of some labels, by task or, where there is one task only, by the number of episodes learned from."""
+    groups = [group for study in read_studies([folder]) for group in study.groups if group.label in labels]
     if not groups:
-        raise SystemExit(f"{folder} holds no rows of the label {label!r}.")
+        raise SystemExit(f"{folder} holds no rows of the labels {labels}.")
     one_task = len({task for group in groups for task, _, _ in group.runs}) == 1
     cells: Cells = {}
     for group in groups:
         for (task, share, algo), runs in sorted(group.runs.items()):
             episodes = round(share * runs[0].final["data"]["n_episodes"])
-            cells[f"{episodes}" if one_task else task.partition("-v")[0], algo] = runs
+            cells.setdefault((f"{episodes}" if one_task else task.partition("-v")[0], algo), []).extend(runs)
     return cells
 
 
@@ -70,10 +70,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("output", type=Path)
-    parser.add_argument("--label", default="")
+    parser.add_argument("--labels", nargs="+", default=[""])
     parser.add_argument("--below", default="")
     arguments = parser.parse_args()
-    draw(read(arguments.folder, arguments.label), arguments.output, arguments.below)
+    draw(read(arguments.folder, arguments.labels), arguments.output, arguments.below)
 
 
 if __name__ == "__main__":

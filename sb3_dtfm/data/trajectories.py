@@ -212,9 +212,10 @@ def check_finite(array: np.ndarray, name: str, where: str) -> None:
     :raises DatasetError: names the first step whose number is NaN, infinite or too large
     """
     # One number per array tells nearly always that all is well; it is NaN or infinite if any entry is.
-    if np.vdot(array, array) < SURELY_FINITE:
+    if float(np.vdot(array, array)) < SURELY_FINITE:
         return
-    bad = ~(np.abs(array) <= np.finfo(np.float32).max)  # also True for NaN
+    largest = np.float64(np.finfo(np.float32).max)  # of a type that NumPy 2 does not cast to float16
+    bad = ~(np.abs(array) <= largest)  # also True for NaN
     if bad.any():
         index = tuple(int(i) for i in np.argwhere(bad)[0])
         column = f", dimension {index[1]}" if len(index) > 1 else ""

@@ -77,18 +77,18 @@ def forged(content: bytes, change, tensors=None, group="policy") -> bytes:
 
 
 def refused(content: bytes, tmp_path: Path) -> str:
-    """What a user reads; within a second, and without more memory than some times the file's."""
+    """What a user reads; soon, and without more memory than some times the file's."""
     path = tmp_path / "model.zip"
     path.write_bytes(content)
     tracemalloc.start()
-    start = time.perf_counter()
+    start = time.process_time()
     try:
         with pytest.raises(ModelFileError) as error:
             DTFM.load(path)
         assert tracemalloc.get_traced_memory()[1] < 2**26
     finally:
         tracemalloc.stop()
-    assert time.perf_counter() - start < 3.0  # a second, on a machine that has other things to do
+    assert time.process_time() - start < 3.0  # a second where nobody traces memory; of the processor, whoever else uses it
     assert str(path) in str(error.value)
     return str(error.value)
 
