@@ -11,6 +11,7 @@ before it goes aside; one whose first grasp is often a near miss. `several` is a
 """
 
 import argparse
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -23,11 +24,9 @@ from sb3_dtfm.recording.demonstrations import record_demonstrations
 class Slow(Demonstrator):
     """Takes its time, comes in low, and grasps deep."""
 
-    speed_share = 0.6
-
     def reset(self) -> None:
         super().reset()
-        self.manner.speed *= self.speed_share
+        self.manner.speed *= 0.6
         self.manner.hover_height *= 0.5
         self.manner.grasp_offset[2] -= 0.006
         self.manner.dwell += 3
@@ -72,24 +71,20 @@ class Missing(Demonstrator):
 STYLES = (Slow, Quick, Level, Missing)
 
 
-def demonstrator(style: str, script: type[Demonstrator]) -> type[Demonstrator]:
+def demonstrator(style: str, script: type[Demonstrator]) -> Callable[..., Demonstrator]:
     """
     The packaged script in another style.
 
     :param style: name of one, or "several"
     :param script: of the task
+    :return: makes the demonstrator of an episode from its seed and pause
     """
-    people = [type(each.__name__, (each, script), {}) for each in STYLES]
-    if style != "several":
-        return {person.__name__.lower(): person for person in people}[style]
+    people = {each.__name__.lower(): type(each.__name__, (each, script), {}) for each in STYLES}
 
-    class Several(script):
-        """One of the four, for an episode."""
+    def one_of_all(seed: int | None = None, pause: float = 0.0) -> Demonstrator:
+        return list(people.values())[np.random.default_rng(seed).integers(len(people))](seed, pause)
 
-        def __new__(cls, seed: int | None = None, pause: float = 0.0) -> Demonstrator:
-            return people[np.random.default_rng(seed).integers(len(people))](seed, pause)
-
-    return Several
+    return one_of_all if style == "several" else people[style]
 
 
 def main() -> None:

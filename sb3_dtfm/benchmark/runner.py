@@ -137,9 +137,8 @@ class Runner:
         command = [*TRAIN, "--algo", job.cell.algo, "--env", job.cell.task, "--seed", str(job.cell.seed)]
         command += ["--conf-file", str(folder / SETTINGS), "--log-folder", str(folder / LOGS), "--eval-freq", "-1"]
         command += ["--verbose", "0", "--device", self.options.device, "--num-threads", str(self._n_threads)]
-        run = (
-            folder / LOGS / job.cell.algo / f"{EnvironmentName(job.cell.task)}_1"
-        )  # RL-Zoo's name for an attempt's only run
+        # RL-Zoo's name for an attempt's only run.
+        run = folder / LOGS / job.cell.algo / f"{EnvironmentName(job.cell.task)}_1"
         if (run / START).is_file() and (folder / ROWS).is_file():
             command += ["--resume", str(run)]
         if self.options.gym_packages:

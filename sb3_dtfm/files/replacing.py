@@ -42,9 +42,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         finally:
             beside.unlink(missing_ok=True)
         _sync(target.parent)
-    except (
-        OSError
-    ) as error:  # whatever was in the way, the hidden file or the folder: this is the name that the caller knows
+    except OSError as error:
+        # Whatever was in the way, the hidden file or the folder: `path` is the name that the caller knows.
         if error.errno is None:  # a library's own message
             raise OSError(f"{path}: {error}") from error
         raise OSError(error.errno, error.strerror, str(path)) from error

@@ -105,12 +105,12 @@ class OfflineExperimentManager(ExperimentManager):
         :raises SystemExit: SIGTERM has ended the run
         """
         super().save_trained_model(model)
-        interrupted = self.keeper is not None and not self.keeper.ended
-        if self.keeper is not None and not interrupted:
+        ended = model.num_timesteps >= model._total_timesteps if self.keeper is None else self.keeper.ended
+        if self.keeper is not None and ended:
             self.keeper.remove()
         elif self.keeper is not None:
             if self.signals.asked and not self.signals.at_once:  # else in the midst of a step
                 self.keeper.save()
             print(f"Interrupted after {model.num_timesteps} steps; sb3-dtfm train --resume {self.save_path} goes on.")
-        if interrupted and self.signals.terminated:
+        if self.signals.terminated and not ended:
             raise SystemExit(128 + signal.SIGTERM)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -109,6 +110,15 @@ def test_an_interrupted_run_goes_on_in_its_folder_to_the_bit(number, code, strai
     assert [path.name for path in Path("logs/dtfm").iterdir()] == [RUN.name]
     assert resume() == 2
     assert "the run is finished" in capsys.readouterr().err
+
+
+def test_sigterm_saves_any_algorithm(workplace):
+    ending = "callback:[{'tests.zoo.test_resuming.SignalAt': {'step': 32, 'number': 15}}]"
+    command = ["train", "--algo", "ppo", "--env", "Pendulum-v1", "-n", "640", "--eval-freq", "-1", "--verbose", "0"]
+    with pytest.raises(SystemExit) as ended:
+        main([*command, "-params", "n_envs:1", "n_steps:16", "batch_size:16", "normalize:False", ending])
+    assert ended.value.code == 143
+    assert 32 <= PPO.load("logs/ppo/Pendulum-v1_1/Pendulum-v1.zip", device="cpu").num_timesteps < 640
 
 
 @pytest.mark.parametrize("interval", [0.0, 1e9])
