@@ -16,7 +16,7 @@ ROOMS = {
     "files": ("sb3_dtfm/files", {"files"}),
     "heads": ("sb3_dtfm/heads", {"heads", "networks", "arguments"}),
     "envs": ("envs", {"envs"}),
-    "data": ("sb3_dtfm/data", {"data", "envs", "windows"}),
+    "data": ("sb3_dtfm/data", {"data", "envs", "files", "windows"}),
     "recording": ("sb3_dtfm/recording", {"recording", "algorithms", "envs", "data", "files"}),
     "policies": ("sb3_dtfm/policies", {"networks", "heads", "windows", "arguments", "policies"}),
     "callbacks": ("sb3_dtfm/callbacks.py", {"data"}),

@@ -3,11 +3,9 @@
 import io
 from abc import ABC
 from collections.abc import Iterable
-from os import PathLike
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeVar
 
-import minari
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -38,7 +36,7 @@ from sb3_dtfm.arguments import (
     Rule,
     check_arguments,
 )
-from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer, check_action_space, load_dataset
+from sb3_dtfm.data import Dataset, DatasetError, ScoreReference, TrajectoryBuffer, check_action_space, load_dataset
 from sb3_dtfm.distributed import check_batch_size, first_of_each_machine_first, is_first_process
 from sb3_dtfm.envs import check_vec_env, return_to_go_space
 from sb3_dtfm.files import ModelFile, ModelFileError, file_name, holds_pickles, read_model, write_model
@@ -46,7 +44,6 @@ from sb3_dtfm.optimization import LEARNING_RATE_SCHEDULES, PRECISIONS, RunningMe
 from sb3_dtfm.policies import SequencePolicy
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineAlgorithm")
-Dataset: TypeAlias = str | PathLike[str] | minari.MinariDataset | TrajectoryBuffer
 
 ACCEPTED: dict[str, Rule] = {
     "batch_size": COUNT,
@@ -72,8 +69,9 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
 
     :param policy: "MultiInputPolicy" or a policy class
     :param env: environment wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`; optional, never used for learning
-    :param dataset: Minari id or dataset, path to a robomimic hdf5 file or to `.npz` arrays, or a
-        :class:`~sb3_dtfm.data.TrajectoryBuffer`
+    :param dataset: Minari id or dataset, path to a robomimic hdf5 file or to flat arrays (`.npz`, hdf5), or what is in
+        memory: a dictionary of arrays, a list of episodes, an SB3 `ReplayBuffer`, a
+        :class:`~sb3_dtfm.data.TrajectoryBuffer`; see :func:`~sb3_dtfm.data.load_dataset`
     :param learning_rate: AdamW's, a number or a function of the progress remaining (from 1 to 0)
     :param batch_size: windows in a gradient step, of all processes together
     :param weight_decay: AdamW's, on weight matrices only
@@ -210,7 +208,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
                 f"{name}.load(path, dataset=...) or model.set_dataset(...)."
             )
         with first_of_each_machine_first():
-            buffer = load_dataset(self.dataset, **(self.dataset_kwargs or {}))
+            action_space = getattr(self, "action_space", None)
+            buffer = load_dataset(self.dataset, **{"action_space": action_space, **(self.dataset_kwargs or {})})
         observation_space = return_to_go_space(buffer.observation_space)
         if getattr(self, "observation_space", None) is None:
             self.observation_space, self.action_space, self.n_envs = observation_space, buffer.action_space, 1

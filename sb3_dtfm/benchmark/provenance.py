@@ -78,7 +78,7 @@ def describe_data(
     What a dataset was recorded from, and how good that was: the scale of normalised scores.
 
     :param env_id: of the task
-    :param dataset: Minari id, robomimic or .npz file
+    :param dataset: Minari id, robomimic file or flat arrays
     :param dataset_kwargs: of :func:`~sb3_dtfm.data.load_dataset`
     :param recorded_from: the agent or demonstrator, read from the dataset's metadata if not given
     :return: dataset (a file without its folder), recorded_from, n_episodes, n_steps, and mean_return of the episodes

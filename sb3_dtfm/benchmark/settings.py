@@ -25,7 +25,7 @@ class Task(NamedTuple):
     What is asked for one task beside the profile.
 
     :param env_id: Gymnasium id
-    :param dataset: Minari id, robomimic or .npz file, None for the profile's
+    :param dataset: Minari id, robomimic file or flat arrays, None for the profile's
     :param target_return: in reward units, None for the profile's
     :param recorded_from: the agent or demonstrator, None for what the dataset's metadata say
     """

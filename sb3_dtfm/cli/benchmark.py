@@ -44,7 +44,7 @@ def benchmark_parser() -> argparse.ArgumentParser:
     grid("--gym-packages", nargs="+", default=[], metavar="MODULE", help="to import first: they register tasks")
     grid("--label", default="", help="name of what -params change; part of a cell's identity")
     data = parser.add_argument_group("data").add_argument
-    data("--dataset", **several, metavar="TASK=DATASET", help="Minari id, robomimic or .npz file")
+    data("--dataset", **several, metavar="TASK=DATASET", help="Minari id, robomimic file or flat arrays")
     data("--datasets", metavar="FILE", help="YAML file that says the same for many tasks, see below")
     data("--dataset-cache", metavar="DIR", help="learn from memory-mapped files made in this folder")
     data("--target-return", **several, metavar="[TASK=]RETURN", help="to ask for when acting, in reward units")

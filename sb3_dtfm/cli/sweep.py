@@ -90,7 +90,9 @@ def _parser() -> argparse.ArgumentParser:
     argument = parser.add_argument
     argument("models", nargs="+", metavar="MODEL", help="zip file of dt or dtfm, or folder of a run of `train`")
     argument("--env", required=True, metavar="TASK", help="Gymnasium id")
-    argument("--dataset", required=True, metavar="DATASET", help="what was learned from: Minari id, robomimic or .npz file")
+    argument(
+        "--dataset", required=True, metavar="DATASET", help="what was learned from: Minari id, robomimic file or flat arrays"
+    )
     argument("--dataset-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="options of its reader")
     argument("--algo", choices=ALGORITHMS, help="of all models; by the folder dt or dtfm that they are in by default")
     argument("--returns", nargs="+", type=float, metavar="R", help="to ask for; evenly over the dataset's by default")

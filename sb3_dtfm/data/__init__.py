@@ -2,13 +2,15 @@
 
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.episodes import Statistics
+from sb3_dtfm.data.flat import load_flat
+from sb3_dtfm.data.in_memory import load_episodes, load_replay_buffer
 from sb3_dtfm.data.minari import load_minari
-from sb3_dtfm.data.npz import load_npz
-from sb3_dtfm.data.readers import load_dataset
+from sb3_dtfm.data.readers import Dataset, load_dataset
 from sb3_dtfm.data.robomimic import load_robomimic
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, check_action_space, returns_to_go
 
 __all__ = [
+    "Dataset",
     "DatasetError",
     "ScoreReference",
     "Statistics",
@@ -16,8 +18,10 @@ __all__ = [
     "TrajectoryBuffer",
     "check_action_space",
     "load_dataset",
+    "load_episodes",
+    "load_flat",
     "load_minari",
-    "load_npz",
+    "load_replay_buffer",
     "load_robomimic",
     "returns_to_go",
 ]

@@ -2,8 +2,10 @@
 
 import copy
 import itertools
+import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 import torch as th
@@ -20,6 +22,7 @@ from sb3_dtfm.data.trajectories import (
     check_size,
     check_trajectory,
 )
+from sb3_dtfm.files import replacing
 from sb3_dtfm.windows import Windows
 
 # A buffer moves to an accelerator if it takes at most this share of the memory that is free there.
@@ -272,6 +275,26 @@ class TrajectoryBuffer:
             return self
         n_kept = max(1, round(fraction * self.n_episodes))
         return self.select(np.sort(np.random.default_rng(seed).permutation(self.n_episodes)[:n_kept]))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """
+        Write the buffer's own steps as flat arrays, which `dataset=` and `--dataset` take.
+
+        :param path: of the file; `.npz` is added where it is missing
+        :raises OSError: it cannot be written; what was there before still is
+        """
+        path = Path(path)
+        path = path if path.suffix == ".npz" else path.with_name(f"{path.name}.npz")
+        rows, stops = self.rows, self._stops.cpu().numpy()
+        ended = {name: np.zeros(len(self), bool) for name in ("terminations", "truncations")}
+        ended["terminations"][stops - 1], ended["truncations"][stops - 1] = self.terminated, self.truncated
+        steps = {
+            name: getattr(self, name).index_select(0, rows).cpu().numpy() for name in ("observations", "actions", "rewards")
+        }
+        space = {"action_low": self.action_space.low, "action_high": self.action_space.high}
+        named = {} if self.env_id is None else {"env_id": np.array(self.env_id)}
+        with replacing(path) as beside, open(beside, "wb") as file:
+            np.savez(file, **steps, **ended, episode_ends=stops, **space, **named)
 
     def to(self, device: th.device | str) -> "TrajectoryBuffer":
         """

@@ -1,14 +1,13 @@
 """Reading Minari datasets into a `TrajectoryBuffer`."""
 
 import contextlib
-import itertools
 import json
 import math
 import reprlib
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import h5py
 import minari
@@ -22,8 +21,9 @@ from minari.storage import get_dataset_path
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint
 from sb3_dtfm.data.hdf5 import open_group, read_hdf5
+from sb3_dtfm.data.observations import ReadArray, flatten_observations
 from sb3_dtfm.data.storage import FileStorage
-from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, check_flags, check_real, naming
+from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, check_flags, naming
 from sb3_dtfm.envs.return_to_go import flatten_observation_space, sort_observation_space
 
 METADATA_FILE_NAME, HDF5_FILE_NAME = "metadata.json", "main_data.hdf5"
@@ -47,8 +47,6 @@ FIELDS: dict[str, tuple[tuple[type, ...], bool]] = {
 FORMATS = ("hdf5", "arrow", "parquet")
 # Entries of the vector that a step's observation, or action, becomes: no task has as many.
 MOST_ENTRIES = 2**20
-# Gives one of an episode's arrays by its name, followed by the keys of the parts of a Dict or Tuple that lead to it.
-ReadArray: TypeAlias = Callable[..., np.ndarray]
 
 
 def is_minari(dataset: Any) -> bool:
@@ -304,7 +302,7 @@ def make_trajectory(read: ReadArray, observation_space: spaces.Space, name: str,
     n_steps = len(rewards)
     if len(actions) != n_steps:
         raise DatasetError(f"{where}: holds {len(actions)} actions for {n_steps} rewards; as many are expected.")
-    columns = _flatten_observations(read, ("observations",), sort_observation_space(observation_space), where)
+    columns = flatten_observations(read, ("observations",), sort_observation_space(observation_space), where)
     counts = sorted({len(column) for column in columns})
     if len(counts) != 1 or counts[0] - n_steps not in (0, 1):
         raise DatasetError(
@@ -322,34 +320,3 @@ def make_trajectory(read: ReadArray, observation_space: spaces.Space, name: str,
         truncated=bool(truncations[-1:].any()),
         name=name,
     )
-
-
-def _flatten_observations(read: ReadArray, path: tuple[str | int, ...], space: spaces.Space, where: str) -> list[np.ndarray]:
-    """
-    A whole episode's observations as columns of the vector that the wrapper makes of one observation.
-
-    :param read: see :func:`make_trajectory`
-    :param path: keys that lead to the part of the observations that `space` describes
-    :param space: observation space with sorted keys
-    :return: arrays (T + 1, .) to be joined along the second axis
-    """
-    if isinstance(space, spaces.Dict | spaces.Tuple):
-        parts = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
-        columns = [_flatten_observations(read, (*path, key), part, where) for key, part in parts]
-        return list(itertools.chain.from_iterable(columns))
-    values, name = read(*path), "/".join(map(str, path))
-    check_real(values.dtype, f"{where}: {name}")
-    size = math.prod(space.shape or ())
-    if values.shape[1:] not in (space.shape, (size,)):
-        raise DatasetError(
-            f"{where}: {name} have shape {values.shape}, expected (steps, {', '.join(map(str, space.shape or ()))})."
-        )
-    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
-        return [np.stack([_one_hot(space, value, f"{where}: {name}") for value in values])]
-    return [values.reshape(len(values), size)]
-
-
-def _one_hot(space: spaces.Space, value: Any, where: str) -> np.ndarray:
-    if not space.contains(value):  # NumPy would count a negative one from the end
-        raise DatasetError(f"{where} hold {value}, which is not in {space}.")
-    return np.asarray(spaces.flatten(space, value))

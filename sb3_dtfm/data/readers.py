@@ -3,18 +3,26 @@
 import copy
 import inspect
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
+from gymnasium import spaces
 from minari import MinariDataset
+from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, load_cached
+from sb3_dtfm.data.flat import fingerprint_flat_file, is_flat_file, is_mapping, load_flat
+from sb3_dtfm.data.in_memory import is_episodes, is_replay_buffer, load_episodes, load_replay_buffer
 from sb3_dtfm.data.minari import fingerprint_minari, is_minari, load_minari
-from sb3_dtfm.data.npz import fingerprint_npz, is_npz, load_npz
 from sb3_dtfm.data.robomimic import fingerprint_robomimic, is_robomimic, load_robomimic
 from sb3_dtfm.data.trajectories import DatasetError
+
+# All that is accepted as a dataset; load_dataset says more.
+Dataset: TypeAlias = (
+    str | os.PathLike[str] | MinariDataset | Mapping[str, Any] | Sequence[Any] | ReplayBuffer | TrajectoryBuffer
+)
 
 
 class Reader(NamedTuple):
@@ -35,40 +43,49 @@ class Reader(NamedTuple):
 
 # The first one that accepts a dataset reads it.
 READERS = (
-    Reader("the path of a file of flat arrays (.npz)", is_npz, load_npz, fingerprint_npz),
+    Reader("the path of a file of flat arrays (.npz, .hdf5)", is_flat_file, load_flat, fingerprint_flat_file),
     Reader("the path of a robomimic file (.hdf5)", is_robomimic, load_robomimic, fingerprint_robomimic),
     Reader("a Minari id (namespace/name-vN) or MinariDataset", is_minari, load_minari, fingerprint_minari),
+    Reader("a dictionary of flat arrays", is_mapping, load_flat, None),
+    Reader("a list of episodes", is_episodes, load_episodes, None),
+    Reader("an SB3 ReplayBuffer", is_replay_buffer, load_replay_buffer, None),
     Reader("a TrajectoryBuffer", lambda dataset: isinstance(dataset, TrajectoryBuffer), lambda dataset: dataset, None),
 )
 
 
 def load_dataset(
-    dataset: str | os.PathLike[str] | MinariDataset | TrajectoryBuffer,
+    dataset: Dataset,
     cache_dir: str | os.PathLike[str] | None = None,
     env_id: str | None = None,
+    action_space: spaces.Box | None = None,
     **kwargs: Any,
 ) -> TrajectoryBuffer:
     """
     Read recorded episodes from wherever they are.
 
-    :param dataset: a Minari id (`namespace/name-vN`), an opened Minari dataset, the path of a robomimic hdf5 file or
-        of flat arrays (`.npz`), or a buffer, which is returned as it is
+    :param dataset: a Minari id (`namespace/name-vN`), an opened Minari dataset, the path of a robomimic hdf5 file, the path
+        of flat arrays (`.npz`, or D4RL's hdf5) or a dictionary of them, see :func:`load_flat`, a list of episodes, see
+        :func:`load_episodes`, an SB3 replay buffer, see :func:`load_replay_buffer`, or a buffer, which is returned as it is
     :param cache_dir: learn from memory-mapped files in this folder, for datasets larger than memory; they are written at
         the first call and whenever the dataset has changed. None reads everything into memory
     :param env_id: Gymnasium id of the environment that the episodes count as coming from, whatever the dataset says
+    :param action_space: the environment's, for data that do not tell of a range of actions
     :param kwargs: options of the reader: `on_invalid`, which is "raise" unless "drop" leaves episodes out that would be
         refused, with a warning that names their number and the first reason; `filter_key` and `observation_keys` for
-        robomimic files, see also :func:`load_npz`
+        robomimic files, see also :func:`load_flat`
     :raises DatasetError: `dataset` is nothing of the above, its reader refuses it, or its cache cannot be used
     :raises TypeError: the reader has no such option
     """
     reader = _find_reader(dataset)
-    own = [name for name in inspect.signature(reader.load).parameters if name != "storage"][1:]
+    own = [name for name in inspect.signature(reader.load).parameters if name not in ("storage", "action_space")][1:]
     given = kwargs if cache_dir is None else {**kwargs, "cache_dir": cache_dir}
-    accepted = [*own, *(["cache_dir"] if reader.fingerprint else []), "env_id"]
+    accepted = [*own, *(["cache_dir"] if reader.fingerprint else []), "env_id", "action_space"]
     unknown = sorted(set(given) - set(accepted))
     if unknown:
-        raise TypeError(f"dataset {dataset!s}: unknown option {', '.join(unknown)}; accepted: {', '.join(accepted)}.")
+        name = str(dataset) if reader.fingerprint else reader.kind
+        raise TypeError(f"dataset {name}: unknown option {', '.join(unknown)}; accepted: {', '.join(accepted)}.")
+    if "action_space" in inspect.signature(reader.load).parameters:
+        kwargs["action_space"] = action_space
     if cache_dir is None or reader.fingerprint is None:
         buffer = reader.load(dataset, **kwargs)
     else:

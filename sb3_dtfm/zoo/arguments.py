@@ -67,7 +67,7 @@ def train_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     offline = parser.add_argument_group(f"of {' and '.join(ALGORITHMS)}").add_argument
-    offline("--dataset", help="Minari id, robomimic hdf5 file or .npz file to learn from")
+    offline("--dataset", help="Minari id, robomimic hdf5 file, or .npz or hdf5 file of flat arrays to learn from")
     offline("--dataset-fraction", type=float, help="randomly drawn share of the episodes, in (0, 1]")
     offline("--dataset-cache", metavar="DIR", help="learn from memory-mapped files made in this folder")
     offline("--target-return", type=float, help="return to ask for when acting, in reward units")

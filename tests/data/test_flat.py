@@ -1,10 +1,14 @@
 """Flat arrays in one file: what is read, and what is refused."""
 
+import gymnasium as gym
+import h5py
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from sb3_dtfm import DT
-from sb3_dtfm.data import DatasetError, load_dataset, load_npz
+from sb3_dtfm.data import DatasetError, load_dataset, load_flat
+from sb3_dtfm.envs import ReturnToGoWrapper
 
 N, STOPS = 9, [2, 5, 9]
 
@@ -55,7 +59,7 @@ def test_episodes_are_what_was_written(changes, path):
 
 
 def test_without_rewards_every_episode_is_a_success(path):
-    buffer = load_npz(write(path, rewards=None))
+    buffer = load_flat(write(path, rewards=None))
     assert buffer.rewards.tolist() == [0, 1, 0, 0, 1, 0, 0, 0, 1]
     assert buffer.terminated.all()
 
@@ -63,26 +67,29 @@ def test_without_rewards_every_episode_is_a_success(path):
 def test_other_names_and_chosen_observations(path):
     extra = np.arange(N * 4.0).reshape(N, 2, 2)
     write(path, observations=None, actions=None, state=np.ones((N, 1)), action=np.zeros((N, 2)), keypoint=extra)
-    assert load_npz(path).observation_space.shape == (1,)
-    both = load_npz(path, observation_keys=["keypoint", "state"])
+    assert load_flat(path).observation_space.shape == (1,)
+    both = load_flat(path, observation_keys=["keypoint", "state"])
     np.testing.assert_array_equal(both.observations, np.hstack([extra.reshape(N, 4), np.ones((N, 1))]))
 
 
 def test_bounds_of_actions(path):
     write(path, actions=np.linspace(0, 512, 2 * N).reshape(N, 2))
-    buffer = load_npz(path, action_bounds=(0, [512, 600]))
+    buffer = load_flat(path, action_bounds=(0, [512, 600]))
     assert buffer.action_space.high.tolist() == [512, 600]
-    assert load_npz(path, clip_actions=True).actions.max() == 1.0
+    assert load_flat(path, clip_actions=True).actions.max() == 1.0
     cached = load_dataset(path, cache_dir=path.parent / "cache", action_bounds=(np.zeros(2), np.array([512, 600])))
     assert cached.action_space == buffer.action_space
     with pytest.raises(DatasetError, match=r"episodes.npz, episode 0, step 0: action 30.* outside .*\[-1, 1\]"):
-        load_npz(path)
+        load_flat(path)
     with pytest.raises(DatasetError, match=r"action_bounds is \(0, 1, 2\); smallest and largest action .* or 2 each"):
-        load_npz(path, action_bounds=(0, 1, 2))
+        load_flat(path, action_bounds=(0, 1, 2))
 
 
 REFUSED = {
-    "no actions": (dict(actions=None), "has no array one of actions, action, only episode_ends, observations, rewards"),
+    "no actions": (
+        dict(actions=None),
+        "has no array one of actions, action, acts, only episode_ends, observations, rewards",
+    ),
     "no ends": (dict(episode_ends=None), "does not say where episodes end; one of episode_ends, episode_lengths, term"),
     "ends before the end": (dict(episode_ends=[2, 5]), "episode_ends tells of 5 steps in all; actions have 9"),
     "an empty episode": (dict(episode_ends=[2, 2, 9]), "episode_ends tells of 0 steps in episode 1"),
@@ -100,7 +107,80 @@ REFUSED = {
 @pytest.mark.parametrize(("changes", "message"), REFUSED.values(), ids=REFUSED)
 def test_what_does_not_fit_is_refused_by_name(changes, message, path):
     with pytest.raises(DatasetError, match=f"episodes.npz.*{message}"):
-        load_npz(write(path, **changes), clip_actions=True)
+        load_flat(write(path, **changes), clip_actions=True)
+
+
+def test_an_hdf5_file_in_d4rls_layout(tmp_path):
+    path = tmp_path / "hopper.hdf5"
+    found = arrays(episode_ends=None, terminals=flags(1), timeouts=flags(4))
+    with h5py.File(path, "w") as file:
+        for name, array in {**found, "infos/qpos": np.zeros((N, 2)), "next_observations": np.zeros((N, 3))}.items():
+            file[name] = array
+    buffer = load_dataset(str(path))
+    assert buffer.episode_lengths.tolist() == [2, 3, 4]
+    assert (buffer.terminated.tolist(), buffer.truncated.tolist()) == ([True, False, False], [False, True, False])
+    np.testing.assert_array_equal(buffer.observations, found["observations"].astype(np.float32))
+    cached = load_dataset(path, cache_dir=tmp_path / "cache", action_space=spaces.Box(-2, 2, (2,)))
+    assert cached.action_space == spaces.Box(-2, 2, (2,))
+    np.testing.assert_array_equal(cached.returns_to_go, buffer.returns_to_go)
+    with h5py.File(path, "a") as file:
+        del file["rewards"]
+        file["rewards"] = np.array([b"good"] * N)
+    with pytest.raises(DatasetError, match=r"hopper.hdf5: rewards hold .*S4; real numbers"):
+        load_dataset(path)
+
+
+def test_a_dictionary_of_arrays():
+    found = arrays()
+    parts = {"b": found["observations"][:, :1], "a": {"c": found["observations"][:, 1:]}}
+    buffer = load_dataset({**found, "observations": parts}, action_bounds=(-3, 3))
+    np.testing.assert_array_equal(buffer.observations, np.roll(found["observations"], -1, axis=1).astype(np.float32))
+    assert buffer.action_space == spaces.Box(-3, 3, (2,))
+    lists = {name: array.tolist() for name, array in found.items()}
+    assert load_dataset(lists).episode_returns.tolist() == [1, 9, 26]
+    with pytest.raises(DatasetError, match=r"arrays: observations, b has shape \(\); one entry a step"):
+        load_dataset({**found, "observations": {"a": found["observations"], "b": 1}})
+    with pytest.raises(DatasetError, match=r"arrays: observations has entries of different lengths: {'a': 9, 'b': 8}"):
+        load_dataset({**found, "observations": {"a": found["observations"], "b": np.zeros(8)}})
+    with pytest.raises(TypeError, match=r"a dictionary of flat arrays: unknown option cache_dir"):
+        load_dataset(found, cache_dir="cache")
+
+
+def test_the_range_of_actions_is_the_environments_where_nobody_says(path):
+    model = DT("MultiInputPolicy", ReturnToGoWrapper(gym.make("Pendulum-v1"), 0.0), dataset=pendulum(), device="cpu")
+    assert model.buffer.action_space == spaces.Box(-2, 2, (1,))
+    model.buffer.select(np.array([1])).save(path)
+    assert load_dataset(str(path)).action_space == spaces.Box(-2, 2, (1,))
+    with pytest.raises(DatasetError, match=r"holds actions of Box\(-1.0, 1.0.*, the environment's are Box\(-2.0"):
+        DT(
+            "MultiInputPolicy",
+            model.env,
+            dataset=pendulum(),
+            dataset_kwargs={"action_bounds": (-1, 1), "clip_actions": True},
+        )
+
+
+def pendulum():
+    rng = np.random.default_rng(1)
+    return dict(obs=rng.normal(size=(6, 3)), acts=rng.uniform(-2, 2, (6, 1)), rews=-np.ones(6), episode_lengths=[4, 2])
+
+
+def test_what_a_buffer_saves_is_what_it_holds(path):
+    whole = load_flat(write(path, episode_ends=None, terminals=flags(1, 8), timeouts=flags(4)), action_bounds=(-1, [1, 3]))
+    whole.env_id = "Walker2d-v5"
+    part = whole.select(np.array([2, 0]))
+    part.save(path.parent / "part")
+    again = load_dataset(path.parent / "part.npz", action_space=spaces.Box(-9, 9, (2,)))
+    for name in ("observations", "actions", "rewards", "returns_to_go"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(part, name)[part.rows])
+    for name in ("episode_lengths", "episode_returns", "terminated", "truncated"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(part, name))
+    assert (again.action_space, again.env_id) == (whole.action_space, "Walker2d-v5")
+    with pytest.raises(OSError, match=r"part\.npz/x\.npz"):
+        part.save(path.parent / "part.npz" / "x")
+    np.savez(path, **arrays(env_id=np.array(3)))
+    with pytest.raises(DatasetError, match=r"env_id holds int64 .* the id of an environment is expected"):
+        load_flat(path)
 
 
 def test_damaged_and_missing_files(path, tmp_path):
@@ -111,11 +191,11 @@ def test_damaged_and_missing_files(path, tmp_path):
     for content in (b"", b"no archive", whole[:-200], compressed):
         path.write_bytes(content)
         with pytest.raises(DatasetError, match=r"episodes.npz: .*cannot be read"):
-            load_npz(path)
+            load_flat(path)
     with path.open("wb") as file:
         np.save(file, np.zeros(3))
     with pytest.raises(DatasetError, match=r"episodes.npz: cannot be read .*not a zip file"):
-        load_npz(path)
+        load_flat(path)
     with pytest.raises(DatasetError, match=r"none.npz does not exist; the path of a file of flat arrays"):
         load_dataset(tmp_path / "none.npz")
 

@@ -1,0 +1,351 @@
+"""Reading flat arrays, episode after episode, into a `TrajectoryBuffer`: of an `.npz` file, an hdf5 file, or memory."""
+
+import contextlib
+import math
+import os
+import zipfile
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Any
+
+import h5py
+import numpy as np
+from gymnasium import spaces
+
+from sb3_dtfm.data.buffer import TrajectoryBuffer
+from sb3_dtfm.data.cache import Fingerprint, existing_file
+from sb3_dtfm.data.hdf5 import read_hdf5
+from sb3_dtfm.data.observations import as_vectors
+from sb3_dtfm.data.storage import FileStorage
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_flags, check_real, check_size, naming
+
+NPZ_SUFFIX = ".npz"
+EXPECTED = "the path of a file of flat arrays (.npz, .hdf5)"
+# What others call the same array: the first that is there is read.
+OBSERVATIONS = ("observations", "observation", "obs", "states", "state")
+ACTIONS = ("actions", "action", "acts")
+REWARDS = ("rewards", "reward", "rews")
+ENDS, LENGTHS = "episode_ends", "episode_lengths"
+TERMINATIONS = ("terminations", "terminals", "terminated", "terminal")
+TRUNCATIONS = ("truncations", "timeouts", "truncated")
+# What TrajectoryBuffer.save adds.
+LOW, HIGH, ENV_ID = "action_low", "action_high", "env_id"
+
+
+def is_flat_file(dataset: Any) -> bool:
+    """Whether this is the path of such a file: an `.npz` by its name, an hdf5 file by the actions that lie at its top."""
+    if not isinstance(dataset, str | os.PathLike):
+        return False
+    if os.fspath(dataset).endswith(NPZ_SUFFIX):
+        return True
+    with contextlib.suppress(OSError, RuntimeError, ValueError):
+        path = os.path.expanduser(dataset)
+        if os.path.isfile(path) and h5py.is_hdf5(path):
+            with h5py.File(path, "r") as file:
+                return any(name in file for name in ACTIONS)
+    return False
+
+
+def is_mapping(dataset: Any) -> bool:
+    """Whether these are arrays by their names."""
+    return isinstance(dataset, Mapping)
+
+
+def fingerprint_flat_file(path: str | os.PathLike[str], options: dict[str, Any]) -> Fingerprint:
+    """
+    Of a file as it is now.
+
+    :param path: the file
+    :param options: of :func:`load_flat`
+    :raises DatasetError: no such file
+    """
+    path = existing_file(path, EXPECTED)
+    options = dict(options)
+    space = options.pop("action_space", None)
+    if "action_bounds" not in options and space is not None:
+        options["action_bounds"] = (space.low, space.high)
+    if options.get("action_bounds") is not None:  # arrays become lists, as JSON can hold them
+        options["action_bounds"] = [np.asarray(bound).tolist() for bound in options["action_bounds"]]
+    return Fingerprint.of(path.name, path, options)
+
+
+def load_flat(
+    dataset: str | os.PathLike[str] | Mapping[str, Any],
+    observation_keys: Sequence[str] | None = None,
+    action_bounds: Sequence[Any] | None = None,
+    clip_actions: bool = False,
+    action_space: spaces.Box | None = None,
+    on_invalid: str = "raise",
+    storage: FileStorage | None = None,
+) -> TrajectoryBuffer:
+    """
+    Episodes one after the other in flat arrays of N steps: as `numpy.savez` writes them, in D4RL's hdf5 files, or in memory.
+
+    Read are `observations` (N, O), `actions` (N, A) and `rewards` (N,), or what others call them (`obs`, `state`, `action`,
+    `reward`). Episodes end where `episode_ends` says (E,), counting steps from the start of the file, or after
+    `episode_lengths` (E,) each, or at the steps of `terminals` or `timeouts` (N,). Without rewards every episode counts as a
+    success: a reward of 1 at its last step. Nothing in a file is ever executed: arrays of Python objects are refused. The
+    arrays are read into memory, also to write a cache of them.
+
+    :param dataset: path of the file, or arrays by name
+    :param observation_keys: which arrays make up the observation, in this order, each (N, ...)
+    :param action_bounds: smallest and largest action that the environment accepts, numbers or (A,) each; where they are not
+        given, a file's own `action_low` and `action_high`, or those of `action_space`, or -1 and 1
+    :param clip_actions: bring actions outside of them to the nearest bound, however far, instead of refusing them
+    :param action_space: the environment's
+    :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
+    :param storage: where the steps go, memory if not given
+    :raises DatasetError: no such file, damaged, arrays missing or of lengths that do not fit together, NaN or infinity, or
+        actions out of bounds; names the file, the array, the episode and the step
+    """
+    with _opened(dataset) as arrays:
+        return _read(arrays, observation_keys, action_bounds, clip_actions, action_space, on_invalid, storage)
+
+
+class _Arrays(ABC):
+    """
+    Arrays by name, none of which is read before it has been looked at.
+
+    :param source: what they are called, for messages
+    :param names: of all that are there
+    :param n_stored: bytes of the file, None in memory
+    """
+
+    def __init__(self, source: str, names: Collection[str], n_stored: int | None = None) -> None:
+        self.source = source
+        self.n_stored = n_stored
+        self._names = names
+
+    @abstractmethod
+    def _get(self, name: str, where: str) -> np.ndarray:
+        """A whole array of numbers."""
+
+    def has(self, names: Sequence[str]) -> bool:
+        """Whether there is one of these."""
+        return any(name in self._names for name in names)
+
+    def name(self, names: Sequence[str]) -> str:
+        """The first of the names that is there."""
+        for name in names:
+            if name in self._names:
+                return name
+        accepted = names[0] if len(names) == 1 else f"one of {', '.join(names)}"
+        found = ", ".join(sorted(map(str, self._names))) or "nothing"
+        raise DatasetError(f"{self.source}: has no array {accepted}, only {found}.")
+
+    def read(self, names: Sequence[str], n_steps: int | None = None) -> np.ndarray:
+        """The first of the named arrays that is there: numbers, one entry a step."""
+        name = self.name(names)
+        where = f"{self.source}: {name}"
+        with naming(where):
+            array = self._get(name, where)
+        check_real(array.dtype, where)
+        if n_steps is not None and array.shape[:1] != (n_steps,):
+            raise DatasetError(f"{where} has shape {array.shape} and actions have {n_steps} steps.")
+        return array
+
+    def env_id(self) -> str | None:
+        """The environment that :meth:`TrajectoryBuffer.save` has written."""
+        return None
+
+
+class _Npz(_Arrays):
+    """Of an opened archive."""
+
+    def __init__(self, archive: zipfile.ZipFile, source: str) -> None:
+        self._archive = archive
+        self._members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+        super().__init__(source, self._members, os.path.getsize(source))
+
+    def _get(self, name: str, where: str) -> np.ndarray:
+        check_real(self._header(name, where), where)
+        return self._stored(name)
+
+    def env_id(self) -> str | None:
+        where = f"{self.source}: {ENV_ID}"
+        if not self.has((ENV_ID,)):
+            return None
+        with naming(where):
+            dtype = self._header(ENV_ID, where)
+            array = self._stored(ENV_ID) if dtype.kind == "U" else np.zeros(0)
+        if array.size != 1:
+            raise DatasetError(f"{where} holds {dtype} of shape {array.shape}; the id of an environment is expected.")
+        return str(array.reshape(()))
+
+    def _stored(self, name: str) -> np.ndarray:
+        with self._archive.open(self._members[name]) as stream:
+            return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
+
+    def _header(self, name: str, where: str) -> np.dtype:
+        """Refuse what an array claims to be before memory is taken for it."""
+        member = self._members[name]
+        with self._archive.open(member) as stream:
+            version = np.lib.format.read_magic(stream)
+            read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, dtype = read_header(stream)
+            n_left = member.file_size - stream.tell()
+        n_bytes = math.prod(shape) * dtype.itemsize
+        if n_bytes != n_left and not dtype.hasobject:
+            raise DatasetError(f"{where} has shape {shape}, which takes {n_bytes} bytes; there are {n_left}.")
+        check_size(n_bytes, self.n_stored or 0, where)
+        return dtype
+
+
+class _Hdf5(_Arrays):
+    """Of an opened file, at its top."""
+
+    def __init__(self, file: h5py.File, source: str) -> None:
+        super().__init__(source, set(file), os.path.getsize(source))
+        self._file = file
+
+    def _get(self, name: str, where: str) -> np.ndarray:
+        return read_hdf5(self._file, name, self.source)
+
+
+class _InMemory(_Arrays):
+    """Of anyone's own; observations may be a dictionary of arrays."""
+
+    def __init__(self, arrays: Mapping[str, Any]) -> None:
+        super().__init__("arrays", arrays)
+        self._arrays = arrays
+
+    def _get(self, name: str, where: str) -> np.ndarray:
+        found = self._arrays[name]
+        return as_vectors(found, where) if isinstance(found, Mapping) else np.asarray(found)
+
+
+@contextlib.contextmanager
+def _opened(dataset: str | os.PathLike[str] | Mapping[str, Any]) -> Iterator[_Arrays]:
+    if isinstance(dataset, Mapping):
+        yield _InMemory(dataset)
+        return
+    path = existing_file(dataset, EXPECTED)
+    source = str(path)
+    with naming(source), contextlib.ExitStack() as stack:
+        if path.name.endswith(NPZ_SUFFIX):
+            yield _Npz(stack.enter_context(zipfile.ZipFile(path)), source)
+        else:
+            yield _Hdf5(stack.enter_context(h5py.File(path, "r")), source)
+
+
+def _read(
+    arrays: _Arrays,
+    observation_keys: Sequence[str] | None,
+    action_bounds: Sequence[Any] | None,
+    clip_actions: bool,
+    action_space: spaces.Box | None,
+    on_invalid: str,
+    storage: FileStorage | None,
+) -> TrajectoryBuffer:
+    source = arrays.source
+    actions = arrays.read(ACTIONS)
+    if actions.ndim != 2 or not len(actions):
+        raise DatasetError(f"{source}: actions have shape {actions.shape}; (N, A) is expected, for at least one step.")
+    n_steps = len(actions)
+    keys = observation_keys or (arrays.name(OBSERVATIONS),)
+    observations = [arrays.read((key,), n_steps).reshape(n_steps, -1) for key in keys]
+    observation = observations[0] if len(observations) == 1 else np.concatenate(observations, axis=1)
+    terminated, truncated = (_flags(arrays, names, n_steps) for names in (TERMINATIONS, TRUNCATIONS))
+    stops = _stops(arrays, n_steps, terminated | truncated)
+    has_rewards = arrays.has(REWARDS)
+    rewards = arrays.read(REWARDS, n_steps).reshape(n_steps, -1) if has_rewards else np.zeros((n_steps, 1))
+    if rewards.shape[1] != 1:
+        raise DatasetError(f"{source}: rewards have {rewards.shape[1]} columns; one number a step is expected.")
+    if not has_rewards:
+        rewards[stops - 1] = 1.0
+        terminated[stops - 1] = True
+    if action_bounds is None and arrays.has((LOW,)):
+        action_bounds = arrays.read((LOW,)), arrays.read((HIGH,))
+    action_space = bounded_space(action_bounds, action_space, actions.shape[1], source)
+    if clip_actions:
+        actions = clipped(actions, action_space)
+
+    def trajectory(episode: int) -> Trajectory:
+        start, stop = stops[episode - 1] if episode else 0, stops[episode]
+        return Trajectory(
+            observations=observation[start:stop],
+            actions=actions[start:stop],
+            rewards=rewards[start:stop, 0],
+            terminated=bool(terminated[stop - 1]),
+            truncated=bool(truncated[stop - 1]),
+            name=f"episode {episode}",
+        )
+
+    return TrajectoryBuffer.from_trajectories(
+        map(trajectory, range(len(stops))),
+        action_space,
+        n_steps=n_steps,
+        source=source,
+        env_id=arrays.env_id(),
+        storage=storage,
+        on_invalid=on_invalid,
+        n_stored=arrays.n_stored,
+    )
+
+
+def _flags(arrays: _Arrays, names: Sequence[str], n_steps: int) -> np.ndarray:
+    """(N,) bool, all False where there is no such array."""
+    if not arrays.has(names):
+        return np.zeros(n_steps, bool)
+    return check_flags(arrays.read(names), n_steps, f"{arrays.source}: {arrays.name(names)}")
+
+
+def _stops(arrays: _Arrays, n_steps: int, ended: np.ndarray) -> np.ndarray:
+    """Steps of the file at which each episode has ended, (E,) int64, ascending, the last one N."""
+    told = [_told_stops(arrays, name, n_steps) for name in (ENDS, LENGTHS) if arrays.has((name,))]
+    if len(told) == 2 and not np.array_equal(told[0], told[1]):
+        raise DatasetError(f"{arrays.source}: {ENDS} and {LENGTHS} tell of other episodes; one of them is enough.")
+    if told:
+        return told[0]
+    if ended.any():
+        stops = np.flatnonzero(ended) + 1
+        return stops if stops[-1] == n_steps else np.append(stops, n_steps)  # the last recording stopped mid-episode
+    accepted = ", ".join((ENDS, LENGTHS, *TERMINATIONS, *TRUNCATIONS))
+    raise DatasetError(f"{arrays.source}: does not say where episodes end; one of {accepted} is needed.")
+
+
+def _told_stops(arrays: _Arrays, name: str, n_steps: int) -> np.ndarray:
+    """As :func:`_stops`, from the array of this name."""
+    array = arrays.read((name,))
+    with np.errstate(invalid="ignore"):
+        numbers = array.reshape(-1).astype(np.int64)
+    if array.shape[:1] != (array.size,) or not (numbers == array.reshape(-1)).all():
+        raise DatasetError(
+            f"{arrays.source}: {name} holds {array.dtype} of shape {array.shape}; whole numbers (E,) are expected."
+        )
+    lengths = np.diff(numbers, prepend=0) if name == ENDS else numbers
+    unfit = (lengths <= 0) | (lengths > n_steps)
+    if unfit.any() or lengths.sum() != n_steps:
+        first = np.flatnonzero(unfit)[:1]
+        found = f"{lengths[first[0]]} steps in episode {first[0]}" if len(first) else f"{lengths.sum()} steps in all"
+        raise DatasetError(
+            f"{arrays.source}: {name} tells of {found}; actions have {n_steps}, and each episode has at least one."
+        )
+    return np.cumsum(lengths)
+
+
+def bounded_space(bounds: Sequence[Any] | None, space: spaces.Box | None, n_actions: int, source: str) -> spaces.Box:
+    """
+    The action space of data that hold numbers alone.
+
+    :param bounds: smallest and largest action, numbers or (A,) each
+    :param space: the environment's, where `bounds` are not given
+    :param n_actions: A
+    :param source: whose actions they are, for messages
+    :return: from -1 to 1 where neither is given
+    :raises DatasetError: `bounds` are something else
+    """
+    if bounds is None and space is not None and space.shape == (n_actions,):
+        return space
+    try:
+        low, high = (np.broadcast_to(np.asarray(bound, np.float32), (n_actions,)) for bound in bounds or (-1.0, 1.0))
+        return spaces.Box(low, high, dtype=np.float32)
+    except (TypeError, ValueError) as error:
+        raise DatasetError(
+            f"{source}: action_bounds is {bounds!r}; smallest and largest action are expected, numbers or {n_actions} each."
+        ) from error
+
+
+def clipped(actions: np.ndarray, space: spaces.Box) -> np.ndarray:
+    """Actions (T, A) inside of the space; what is not finite stays, to be refused."""
+    return np.where(np.isfinite(actions), np.clip(actions, space.low, space.high), actions)

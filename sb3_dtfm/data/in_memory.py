@@ -1,0 +1,214 @@
+"""Reading what is already in memory into a `TrajectoryBuffer`: lists of episodes, and SB3's replay buffers."""
+
+import itertools
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+
+from sb3_dtfm.data.buffer import TrajectoryBuffer
+from sb3_dtfm.data.flat import ACTIONS, OBSERVATIONS, REWARDS, TERMINATIONS, TRUNCATIONS, bounded_space, clipped
+from sb3_dtfm.data.observations import as_vectors, flatten_observations
+from sb3_dtfm.data.storage import FileStorage
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_space, naming
+from sb3_dtfm.envs.return_to_go import flatten_observation_space, sort_observation_space
+
+# What one step of an episode that was written down step by step holds.
+STEP = ("observation", "action", "reward", "terminated", "truncated")
+
+
+def is_episodes(dataset: Any) -> bool:
+    """Whether this is a list, or another sequence, of episodes."""
+    return isinstance(dataset, Sequence) and not isinstance(dataset, str | bytes | os.PathLike)
+
+
+def load_episodes(
+    episodes: Sequence[Any],
+    action_bounds: Sequence[Any] | None = None,
+    clip_actions: bool = False,
+    action_space: spaces.Box | None = None,
+    on_invalid: str = "raise",
+    storage: FileStorage | None = None,
+) -> TrajectoryBuffer:
+    """
+    Episodes one by one, each of which may be
+
+    - a dictionary of `observations` (T, O) or (T + 1, O), `actions` (T, A), `rewards` (T,), and `terminated` and
+      `truncated`, for the episode or for each step, or what others call them; observations may be dictionaries, too
+    - a :class:`~sb3_dtfm.data.Trajectory`
+    - a trajectory of the package imitation: `obs`, `acts`, `terminal`, `rews` where it has some
+    - a list of steps `(observation, action, reward, terminated, truncated)`, as they come from a Gymnasium environment:
+      the observation that the action was chosen on, and what `env.step(action)` then returned, info or not
+
+    Without rewards an episode counts as a success: a reward of 1 at its last step.
+
+    :param episodes: at least one
+    :param action_bounds: see :func:`~sb3_dtfm.data.load_flat`
+    :param clip_actions: see :func:`~sb3_dtfm.data.load_flat`
+    :param action_space: see :func:`~sb3_dtfm.data.load_flat`
+    :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
+    :param storage: where the steps go, memory if not given
+    :raises DatasetError: nothing of the above, arrays missing or of lengths that do not fit together, NaN or infinity, or
+        actions out of bounds; names the episode and the step
+    """
+    source = "episodes"
+    if not len(episodes):
+        raise DatasetError(f"{source}: the list is empty; at least one episode is needed.")
+    shape = _trajectory(episodes[0], 0, source).actions.shape
+    if len(shape) != 2:
+        raise DatasetError(f"{source}, episode 0: actions have shape {shape}; (T, A) is expected.")
+    space = bounded_space(action_bounds, action_space, shape[1], source)
+
+    def trajectory(number: int) -> Trajectory:
+        found = _trajectory(episodes[number], number, source)
+        if clip_actions and found.actions.shape[1:] == space.shape:
+            return replace(found, actions=clipped(found.actions, space))
+        return found
+
+    numbers = range(len(episodes))
+    return TrajectoryBuffer.from_trajectories(
+        map(trajectory, numbers), space, source=source, storage=storage, on_invalid=on_invalid
+    )
+
+
+def _trajectory(episode: Any, number: int, source: str) -> Trajectory:
+    """An episode of any of the kinds of :func:`load_episodes`."""
+    name = f"episode {number}"
+    where = f"{source}, {name}"
+    if isinstance(episode, Trajectory):
+        return episode
+    with naming(where):
+        if isinstance(episode, Mapping):
+            return _of_arrays(episode, name, where)
+        if hasattr(episode, "obs") and hasattr(episode, "acts"):
+            ended = bool(episode.terminal)
+            infos = getattr(episode, "infos", None)
+            late = ended and infos is not None and bool(infos[-1].get("TimeLimit.truncated", False))
+            arrays = {"obs": episode.obs, "acts": episode.acts, "terminated": ended and not late, "truncated": late}
+            return _of_arrays({**arrays, **({"rews": episode.rews} if hasattr(episode, "rews") else {})}, name, where)
+        if is_episodes(episode) and all(is_episodes(step) and len(step) >= len(STEP) for step in episode):
+            observations, actions, rewards, terminated, truncated = list(zip(*episode, strict=False))[: len(STEP)]
+            arrays = {"obs": _stacked(observations), "acts": actions, "rews": rewards}
+            return _of_arrays({**arrays, "terminated": terminated, "truncated": truncated}, name, where)
+    raise DatasetError(
+        f"{where} is a {type(episode).__name__}; accepted are a dictionary of arrays, a Trajectory, a trajectory of "
+        f"imitation, or a list of steps ({', '.join(STEP)})."
+    )
+
+
+def _stacked(observations: Sequence[Any]) -> Any:
+    """One observation after the other as (T, ...), dictionaries as a dictionary of such."""
+    if isinstance(observations[0], Mapping):
+        return {key: _stacked([observation[key] for observation in observations]) for key in observations[0]}
+    return np.stack([np.asarray(observation) for observation in observations])
+
+
+def _of_arrays(arrays: Mapping[str, Any], name: str, where: str) -> Trajectory:
+    """One episode of arrays by the names of flat ones."""
+
+    def find(names: Sequence[str]) -> Any:
+        found = [key for key in names if key in arrays]
+        if not found:
+            there = ", ".join(map(str, arrays)) or "nothing"
+            raise DatasetError(f"{where}: has no array one of {', '.join(names)}, only {there}.")
+        return arrays[found[0]]
+
+    def flag(names: Sequence[str]) -> bool:
+        given = [arrays[key] for key in names if key in arrays]
+        return bool(np.asarray(given[0]).reshape(-1)[-1]) if given else False
+
+    actions = np.asarray(find(ACTIONS))
+    n_steps = len(actions) if actions.ndim else 0
+    observations = as_vectors(find(OBSERVATIONS), f"{where}: observations")
+    if len(observations) == n_steps + 1:  # the last one, after which nobody has acted
+        observations = observations[:n_steps]
+    has_rewards = any(key in arrays for key in REWARDS)
+    rewards = np.asarray(find(REWARDS)) if has_rewards else np.eye(1, n_steps, n_steps - 1)[0]
+    terminated, truncated = flag(TERMINATIONS), flag(TRUNCATIONS)
+    return Trajectory(
+        observations=observations,
+        actions=actions,
+        rewards=rewards.reshape(n_steps) if rewards.size == n_steps else rewards,
+        terminated=terminated or not (has_rewards or truncated),
+        truncated=truncated,
+        name=name,
+    )
+
+
+def is_replay_buffer(dataset: Any) -> bool:
+    """Whether this is one of SB3's replay buffers, `DictReplayBuffer` and the like included."""
+    return isinstance(dataset, ReplayBuffer)
+
+
+def load_replay_buffer(
+    replay_buffer: ReplayBuffer, on_invalid: str = "raise", storage: FileStorage | None = None
+) -> TrajectoryBuffer:
+    """
+    The episodes of a replay buffer, such as `model.replay_buffer` of an SB3 model, environment by environment.
+
+    SB3's algorithms store actions scaled to [-1, 1]; they are brought back into the range of the buffer's action space.
+    Observations and rewards are there as the environment gave them, `VecNormalize` or not. An episode at whose end
+    `TimeLimit.truncated` was said is truncated. The last one of each environment stops where the buffer does; of a full
+    buffer, the first one of each environment is left out, since its beginning has been written over.
+
+    :param replay_buffer: of any number of environments
+    :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
+    :param storage: where the steps go, memory if not given
+    :raises DatasetError: no whole episode, an observation space that cannot be flattened, NaN or infinity, or actions
+        outside of [-1, 1]; names the environment, the episode and the step
+    """
+    source = "replay buffer"
+    try:
+        observation_space = sort_observation_space(replay_buffer.observation_space)
+        flat_space = flatten_observation_space(observation_space)
+    except ValueError as error:
+        raise DatasetError(f"{source}: {error}") from error
+    space = check_action_space(replay_buffer.action_space, source)
+    n_steps = replay_buffer.size()
+    order = (np.arange(n_steps) + (replay_buffer.pos if replay_buffer.full else 0)) % max(1, replay_buffer.buffer_size)
+    dones = replay_buffer.dones[order] > 0
+    if n_steps:
+        dones[-1] = True  # so far
+    pieces = []
+    for env in range(replay_buffer.n_envs):
+        stops = np.flatnonzero(dones[:, env]) + 1
+        starts = np.concatenate(([0], stops[:-1])) if len(stops) else stops
+        pieces += [(env, *piece) for piece in zip(starts, stops, strict=True)][int(replay_buffer.full) :]
+    if not pieces:
+        raise DatasetError(f"{source}: holds no whole episode in {n_steps} steps of {replay_buffer.n_envs} environments.")
+
+    def trajectory(env: int, start: int, stop: int) -> Trajectory:
+        name = f"environment {env}, steps {start} to {stop - 1}"
+        steps = order[start:stop]
+        done, late = (bool(flags[steps[-1], env]) for flags in (replay_buffer.dones, replay_buffer.timeouts))
+
+        def read(_: str, *keys: str) -> np.ndarray:
+            observations: Any = replay_buffer.observations
+            for key in keys:
+                observations = observations[key]
+            return np.asarray(observations[steps, env])
+
+        columns = flatten_observations(read, ("observations",), observation_space, f"{source}, {name}")
+        scaled = replay_buffer.actions[steps, env].astype(np.float64)
+        return Trajectory(
+            observations=np.concatenate(columns, axis=1),
+            actions=space.low + 0.5 * (scaled + 1.0) * (space.high - space.low),
+            rewards=replay_buffer.rewards[steps, env],
+            terminated=done and not late,
+            truncated=done and late,
+            name=name,
+        )
+
+    return TrajectoryBuffer.from_trajectories(
+        itertools.starmap(trajectory, pieces),
+        space,
+        flat_space,
+        n_steps=sum(stop - start for _, start, stop in pieces),
+        source=source,
+        storage=storage,
+        on_invalid=on_invalid,
+    )

@@ -1,0 +1,72 @@
+"""Observations of any structure as the vectors that :class:`~sb3_dtfm.envs.ReturnToGoWrapper` makes of them."""
+
+import itertools
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, TypeAlias
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_dtfm.data.trajectories import DatasetError, check_real
+
+# Gives one of an episode's arrays by its name, followed by the keys of the parts of a Dict or Tuple that lead to it.
+ReadArray: TypeAlias = Callable[..., np.ndarray]
+
+
+def as_vectors(observations: Any, where: str) -> np.ndarray:
+    """
+    Observations of which nobody has told the space.
+
+    :param observations: (T, ...), or a dictionary of such, of any depth
+    :param where: whose they are, for messages
+    :return: (T, O), the entries of a dictionary side by side in the order of their keys
+    :raises DatasetError: parts of different lengths, or without steps
+    """
+    if not isinstance(observations, Mapping):
+        array = np.asarray(observations)
+        check_real(array.dtype, where)
+        if array.ndim == 0 or array.size == 0:
+            raise DatasetError(f"{where} has shape {array.shape}; one entry a step is expected, for at least one step.")
+        return array.reshape(len(array), -1)
+    if not observations:
+        raise DatasetError(f"{where} is an empty dictionary.")
+    parts = {key: as_vectors(observations[key], f"{where}, {key}") for key in sorted(observations)}
+    lengths = {key: len(part) for key, part in parts.items()}
+    if len(set(lengths.values())) > 1:
+        raise DatasetError(f"{where} has entries of different lengths: {lengths}.")
+    return np.concatenate(list(parts.values()), axis=1)
+
+
+def flatten_observations(read: ReadArray, path: tuple[str | int, ...], space: spaces.Space, where: str) -> list[np.ndarray]:
+    """
+    A whole episode's observations as columns of the vector that the wrapper makes of one observation.
+
+    :param read: gives one of its arrays by its name and the keys that lead to a part
+    :param path: keys that lead to the part of the observations that `space` describes
+    :param space: observation space with sorted keys
+    :param where: the file and the episode, for messages
+    :return: arrays (T + 1, .) to be joined along the second axis
+    :raises DatasetError: entries of another shape than the space's, or none of its own
+    """
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        parts = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
+        columns = [flatten_observations(read, (*path, key), part, where) for key, part in parts]
+        return list(itertools.chain.from_iterable(columns))
+    values, name = read(*path), "/".join(map(str, path))
+    check_real(values.dtype, f"{where}: {name}")
+    size = math.prod(space.shape or ())
+    if values.shape[1:] not in (space.shape, (size,)):
+        raise DatasetError(
+            f"{where}: {name} have shape {values.shape}, expected (steps, {', '.join(map(str, space.shape or ()))})."
+        )
+    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
+        values = values.reshape(len(values), *(space.shape or ()))
+        return [np.stack([_one_hot(space, value, f"{where}: {name}") for value in values])]
+    return [values.reshape(len(values), size)]
+
+
+def _one_hot(space: spaces.Space, value: Any, where: str) -> np.ndarray:
+    if not space.contains(value):  # NumPy would count a negative one from the end
+        raise DatasetError(f"{where} hold {value}, which is not in {space}.")
+    return np.asarray(spaces.flatten(space, value))

@@ -1,0 +1,214 @@
+"""What is already in memory: lists of episodes and SB3's replay buffers."""
+
+from dataclasses import dataclass
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
+from stable_baselines3 import DDPG
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_dtfm.data import DatasetError, Trajectory, load_dataset
+
+LENGTHS, N_ACTIONS = (3, 5), 2
+
+
+@dataclass(frozen=True)
+class Obtained:
+    """The fields of a trajectory of the package imitation, whose releases ask for another Gymnasium."""
+
+    obs: np.ndarray
+    acts: np.ndarray
+    infos: np.ndarray | None
+    terminal: bool
+
+
+@dataclass(frozen=True)
+class Rewarded(Obtained):
+    rews: np.ndarray
+
+
+def episodes():
+    rng = np.random.default_rng(0)
+    return [(rng.normal(size=(n + 1, 3)), rng.uniform(-1, 1, (n, N_ACTIONS)), rng.normal(size=n), n == 5) for n in LENGTHS]
+
+
+def steps(obs, acts, rews, late, extra=()):
+    ends = np.arange(1, len(acts) + 1) == len(acts)
+    return [(obs[t], acts[t], rews[t], bool(ends[t] and not late), bool(ends[t] and late), *extra) for t in range(len(acts))]
+
+
+def dictionary(obs, acts, rews, late):
+    return {"observations": obs[:-1], "actions": acts, "rewards": rews, "terminated": not late, "truncated": late}
+
+
+def lists(obs, acts, rews, late):
+    """As JSON would hold it, with the last observation and flags of every step."""
+    nothing = [[False]] * (len(acts) - 1)
+    ends = {"terminals": [*nothing, [not late]], "timeouts": [*nothing, [late]]}
+    return {"obs": obs.tolist(), "action": acts.tolist(), "reward": rews[:, None].tolist(), **ends}
+
+
+def obtained(obs, acts, rews, late):
+    return Rewarded(obs, acts, np.array([{}] * (len(acts) - 1) + [{"TimeLimit.truncated": late}]), True, rews)
+
+
+KINDS = {
+    "dictionaries": dictionary,
+    "lists": lists,
+    "imitation": obtained,
+    "steps": steps,
+    "steps with info": lambda *episode: steps(*episode, extra=({"of": "the environment"},)),
+    "trajectories": lambda obs, acts, rews, late: Trajectory(obs[:-1], acts, rews, not late, late),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_episodes_of_every_kind_are_read_alike(kind):
+    given = episodes()
+    buffer = load_dataset([KINDS[kind](*episode) for episode in given])
+    np.testing.assert_array_equal(buffer.observations, np.concatenate([o[:-1] for o, *_ in given]).astype(np.float32))
+    np.testing.assert_array_equal(buffer.actions, np.concatenate([a for _, a, *_ in given]).astype(np.float32))
+    np.testing.assert_allclose(buffer.episode_returns, [r.sum() for _, _, r, _ in given])
+    assert buffer.episode_lengths.tolist() == list(LENGTHS)
+    assert (buffer.terminated.tolist(), buffer.truncated.tolist()) == ([True, False], [False, True])
+
+
+def test_dictionary_observations_and_no_rewards():
+    o, a, *_ = episodes()[0]
+    buffer = load_dataset(
+        [[({"b": o[t, :1], "a": o[t, 1:]}, 3 * a[t], 0.0, False, False) for t in range(3)]], action_bounds=(-3, 3)
+    )
+    np.testing.assert_array_equal(buffer.observations, np.roll(o[:3], -1, axis=1).astype(np.float32))
+    assert not buffer.terminated.any()
+    buffer = load_dataset([Obtained(o, a, None, True), {"obs": o, "acts": a}])
+    assert buffer.rewards.tolist() == [0, 0, 1] * 2
+    assert buffer.terminated.all()
+
+
+OBS, ACTS, REWS, _ = episodes()[0]
+UNFIT = {
+    "nothing": ([], "the list is empty"),
+    "numbers": ([1, 2], "episode 0 is a int; accepted are a dictionary of arrays, a Trajectory"),
+    "short steps": (
+        [[(OBS[0], ACTS[0], 0.0)]],
+        "episode 0 is a list; accepted are .*observation, action, reward, terminated",
+    ),
+    "a path": (["episode.npz"], "episode 0 is a str"),
+    "no actions": ([{"obs": OBS}], "episode 0: has no array one of actions, action, acts, only obs"),
+    "other actions": (
+        [{"obs": OBS, "acts": ACTS}, {"obs": OBS, "acts": ACTS[:, :1]}],
+        r"episode 1: actions have shape \(3, 1\)",
+    ),
+    "a flat action": ([{"obs": OBS, "acts": ACTS[:, 0]}], r"episode 0: actions have shape \(3,\); \(T, A\) is expected"),
+    "too few observations": (
+        [{"obs": OBS[:2], "acts": ACTS}],
+        r"episode 0: observations have shape \(2, 3\), expected \(3, 3\)",
+    ),
+    "rewards of another length": (
+        [{"obs": OBS, "acts": ACTS, "rews": REWS[:2]}],
+        r"rewards have shape \(2,\), expected \(3,\)",
+    ),
+    "ragged": ([{"obs": [[1.0], [1.0, 2.0]], "acts": ACTS}], "episode 0: cannot be read .*inhomogeneous"),
+    "NaN": ([{"obs": OBS, "acts": ACTS, "rews": REWS * np.nan}], "episode 0, step 0: rewards hold nan"),
+    "outside": (
+        [{"obs": OBS, "acts": 3 * ACTS}],
+        r"episode 0, step 0: action .* lies outside of the action space \[-1, 1\]",
+    ),
+}
+
+
+@pytest.mark.parametrize(("given", "message"), UNFIT.values(), ids=UNFIT)
+def test_what_is_no_episode_is_refused_by_its_number(given, message):
+    with pytest.raises(DatasetError, match=f"episodes.*{message}"):
+        load_dataset(given)
+
+
+def test_an_unfit_episode_can_be_dropped_and_actions_clipped():
+    good, bad = {"obs": OBS, "acts": ACTS}, {"obs": OBS * np.inf, "acts": ACTS}
+    with pytest.warns(UserWarning, match="1 of 2 episodes have been dropped"):
+        assert load_dataset([good, bad], on_invalid="drop").n_episodes == 1
+    assert load_dataset([{"obs": OBS, "acts": 9 * ACTS}], clip_actions=True).actions.abs().max() == 1.0
+
+
+class Course(gym.Env):
+    """Shows what was done: step and episode are observed, actions rewarded; every other episode ends itself."""
+
+    action_space = spaces.Box(np.array([-2.0, 0.0]), np.array([2.0, 10.0]), dtype=np.float64)
+
+    def __init__(self, goal: bool = False) -> None:
+        shape = spaces.Box(-np.inf, np.inf, (3,), np.float64)
+        self.observation_space = spaces.Dict({"b": shape, "a": spaces.Discrete(2)}) if goal else shape
+        self.done, self.episode, self.goal = [], -1, goal
+
+    def see(self):
+        vector = np.array([self.t, self.episode, 0.5])
+        return {"b": vector, "a": self.episode % 2} if self.goal else vector
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t, self.episode = 0, self.episode + 1
+        return self.see(), {}
+
+    def step(self, action):
+        self.t += 1
+        self.done.append(np.array(action))
+        return self.see(), float(action.sum()), self.episode % 2 == 0 and self.t == 4, False, {}
+
+
+@pytest.mark.parametrize("goal", [False, True])
+@pytest.mark.parametrize("buffer_size", [1000, 40])
+def test_the_replay_buffer_of_an_sb3_model(goal, buffer_size):
+    """Actions that the environment was given, time-outs, several environments, normalisation, a buffer that is full."""
+    env = make_vec_env(lambda: TimeLimit(Course(goal), 7), n_envs=2)
+    courses = [each.unwrapped for each in env.envs]
+    keys = {"norm_obs_keys": ["b"]} if goal else {}
+    model = DDPG(
+        "MultiInputPolicy" if goal else "MlpPolicy", VecNormalize(env, **keys), seed=0, buffer_size=buffer_size,
+        learning_starts=100, train_freq=(20, "step"), batch_size=8, policy_kwargs={"net_arch": [4]}, device="cpu",
+    ).learn(60)  # fmt: skip
+    buffer = load_dataset(model.replay_buffer)
+    first = 1 if buffer_size == 40 else 0
+    assert buffer.observation_space.shape == (5 if goal else 3,)
+    n_steps, kept = len(courses[0].done), min(len(courses[0].done), buffer_size // 2)
+    expected = []
+    for course in courses:
+        ends, t = [], 0
+        while t < n_steps:
+            t += 4 if len(ends) % 2 == 0 else 7
+            ends.append(t)
+        starts = [0, *ends[:-1]]
+        whole = [
+            (n, s, min(e, n_steps), e <= n_steps) for n, (s, e) in enumerate(zip(starts, ends, strict=True)) if s < n_steps
+        ]
+        inside = [piece for piece in whole if piece[2] > n_steps - kept][first:]
+        expected += [(course, *piece) for piece in inside]
+    assert buffer.episode_lengths.tolist() == [e - s for _, _, s, e, _ in expected]
+    assert buffer.terminated.tolist() == [ended and n % 2 == 0 for _, n, _, _, ended in expected]
+    assert buffer.truncated.tolist() == [ended and n % 2 == 1 for _, n, _, _, ended in expected]
+    actions = np.concatenate([course.done[s:e] for course, _, s, e, _ in expected])
+    np.testing.assert_allclose(buffer.actions, actions, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(buffer.rewards, actions.sum(axis=1), rtol=1e-5)
+    seen = [[t, n, 0.5] for _, n, s, e, _ in expected for t in range(e - s)]
+    np.testing.assert_array_equal(buffer.observations[:, -3:], np.array(seen, np.float32))
+    if goal:
+        np.testing.assert_array_equal(
+            buffer.observations[:, :2], np.eye(2, dtype=np.float32)[[int(n % 2) for _, n, _ in seen]]
+        )
+    assert np.ptp(actions, axis=0).min() > 1.0  # of ranges 4 and 10: scaled ones would not have been
+
+
+def test_a_replay_buffer_without_a_whole_episode():
+    empty = ReplayBuffer(10, spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2,)), device="cpu")
+    with pytest.raises(DatasetError, match="replay buffer: holds no whole episode in 0 steps of 1 environments"):
+        load_dataset(empty)
+    images = ReplayBuffer(10, spaces.Box(0, 255, (8, 8, 3), np.uint8), spaces.Box(-1, 1, (2,)), device="cpu")
+    with pytest.raises(DatasetError, match=r"replay buffer: Observation space .* holds an image"):
+        load_dataset(images)
+    discrete = ReplayBuffer(10, spaces.Box(-1, 1, (3,)), spaces.Discrete(3), device="cpu")
+    with pytest.raises(DatasetError, match=r"replay buffer: the action space is Discrete\(3\)"):
+        load_dataset(discrete)
