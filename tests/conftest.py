@@ -14,6 +14,11 @@ TINY_FLOW_POLICY = dict(TINY_POLICY, flow_hidden_dim=32, flow_n_layers=2, n_solv
 EPISODE_LENGTH = 30
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Slow tests first: one that begins last would have a core for itself while the other has nothing left to do."""
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+
+
 @pytest.fixture(autouse=True, scope="session")
 def one_thread():
     """

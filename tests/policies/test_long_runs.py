@@ -23,12 +23,17 @@ def memory_in_use() -> tuple[int, int]:
     return sys.getallocatedblocks(), int(RESIDENT_PAGES.read_text().split()[1]) * mmap.PAGESIZE
 
 
+# Ways of acting: the window at every fourth call, and kept keys and values; a million calls in all.
+WAYS = {"chunks": (dict(chunk_size=4, n_action_steps=4), 700_000), "kept keys": (dict(kv_cache=True), 300_000)}
+RUNS = [pytest.param(way, 2_500, id=way) for way in WAYS]
+RUNS += [pytest.param(way, WAYS[way][1], id=f"{way}, slow", marks=pytest.mark.slow) for way in WAYS]
+
+
 @pytest.mark.skipif(not RESIDENT_PAGES.exists(), reason="Linux tells how much memory a process has.")
-@pytest.mark.parametrize("n_calls", [2_500, pytest.param(500_000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("kv_cache", [False, True])
-def test_any_number_of_calls_takes_no_more_memory(n_calls, kv_cache, cheetah_buffer):
+@pytest.mark.parametrize(("way", "n_calls"), RUNS)
+def test_any_number_of_calls_takes_no_more_memory(way, n_calls, cheetah_buffer):
     """A caller who passes a state, and one who is remembered, in turns."""
-    model = make_model(DT, cheetah_buffer, policy_kwargs=dict(SMALLEST, kv_cache=kv_cache))
+    model = make_model(DT, cheetah_buffer, policy_kwargs={**SMALLEST, **WAYS[way][0]})
     numbers = {"observation": np.zeros((2, 17), np.float32), "return_to_go": np.zeros((2, 1), np.float32)}
     state = None
     for call in range(n_calls):
