@@ -44,6 +44,7 @@ class TrajectoryBuffer:
     :ivar rewards: (N,) float32, environment reward units
     :ivar returns_to_go: (N,) float32, environment reward units
     :ivar episodes: the buffer's episodes, one row each
+    :ivar weights: (E,) float64, how often a step of each is drawn beside one of weight 1
     :ivar env_id: Gymnasium id of the environment that they come from, None where nobody says
     :ivar dropped: how many episodes `on_invalid="drop"` has left out, and why the first of them; None where it had none
     :ivar device: what batches are made for
@@ -74,6 +75,7 @@ class TrajectoryBuffer:
         self._maps = maps
         self.device = self.observations.device
         self._present = th.zeros(0, dtype=th.int64)
+        self.weights = np.ones(len(episodes.lengths))
         self._set_episodes(episodes)
         if dropped:
             n_all = dropped[0] + len(episodes.lengths)
@@ -258,8 +260,64 @@ class TrajectoryBuffer:
         :param episodes: (E',) episode indices
         """
         chosen = copy.copy(self)
+        chosen.weights = self.weights[episodes]
         chosen._set_episodes(self.episodes.select(episodes))
         return chosen
+
+    def best(self, min_return: float | None = None, best_share: float | None = None) -> "TrajectoryBuffer":
+        """
+        A buffer of the better episodes, in their order.
+
+        :param min_return: the smallest return that is kept, environment reward units; None keeps all
+        :param best_share: share of the episodes in (0, 1], those of the largest returns; at least one is kept
+        :raises DatasetError: no episode has such a return
+        :raises ValueError: `best_share` outside of (0, 1]
+        """
+        buffer = self
+        if min_return is not None:
+            kept = np.flatnonzero(buffer.episode_returns >= min_return)
+            if not len(kept):
+                found = f"the largest return is {buffer.episode_returns.max():g}"
+                raise DatasetError(f"{self.source}: no episode has min_return {min_return:g}; {found}.")
+            buffer = buffer.select(kept)
+        if best_share is not None:
+            if not 0.0 < best_share <= 1.0:
+                raise ValueError(f"best_share must lie in (0, 1], got {best_share}.")
+            n_kept = max(1, round(best_share * buffer.n_episodes))
+            buffer = buffer.select(np.sort(np.argsort(-buffer.episode_returns, kind="stable")[:n_kept]))
+        return buffer
+
+    @classmethod
+    def join(cls, buffers: Sequence["TrajectoryBuffer"], weights: Sequence[float]) -> "TrajectoryBuffer":
+        """
+        One buffer, in memory, of the episodes of several, one after the other.
+
+        :param buffers: of one task, at least one
+        :param weights: how often a step of each is drawn beside one of weight 1
+        :raises DatasetError: other observations, actions or environments than the first one's
+        """
+        first, source = buffers[0], " + ".join(buffer.source for buffer in buffers)
+        for other in buffers[1:]:
+            sizes = other.observation_space.shape == first.observation_space.shape
+            if not sizes or other.action_space != first.action_space:
+                held = [
+                    f"{each.source} holds {each.observation_space.shape}, {each.action_space}" for each in (first, other)
+                ]
+                raise DatasetError(f"{source}: other observations or actions cannot be joined: {'; '.join(held)}.")
+        named = next((buffer for buffer in buffers if buffer.env_id is not None), first)
+        for other in buffers:
+            if other.env_id is not None:
+                named.check_task(other.env_id)
+        tensors = {
+            name: th.cat([getattr(each, name).index_select(0, each.rows) for each in buffers]) for name in STEP_ARRAYS
+        }
+        table = EpisodeTable(*map(np.concatenate, zip(*(each.episodes for each in buffers), strict=True)))
+        table = table._replace(starts=np.cumsum(table.lengths) - table.lengths)
+        joined = cls(tensors, table, first.observation_space, first.action_space, source, env_id=named.env_id)
+        if len({buffer.score_reference for buffer in buffers}) == 1:
+            joined.score_reference = first.score_reference
+        joined.weights = np.concatenate([w * each.weights for w, each in zip(weights, buffers, strict=True)])
+        return joined
 
     def random_fraction(self, fraction: float, seed: int) -> "TrajectoryBuffer":
         """
@@ -342,7 +400,8 @@ class TrajectoryBuffer:
         :param seeds: what `generator` is seeded with before it draws, one number a batch: where each is its own, a run that
             goes on draws what it would have drawn. Without them the generator draws on
         """
-        weights = self._episode_weights(return_weight).to(generator.device) if return_weight > 0 else None
+        differ = return_weight > 0 or (self.weights != self.weights[0]).any()
+        weights = self._episode_weights(return_weight).to(generator.device) if differ else None
 
         def ends() -> Iterator[th.Tensor]:
             for seed in itertools.repeat(None) if seeds is None else seeds:
@@ -371,9 +430,10 @@ class TrajectoryBuffer:
         return self.windows(self._draw(batch_size, generator), context_length)
 
     def _episode_weights(self, return_weight: float) -> th.Tensor:
-        """(E,) float32, with what probability an episode is drawn, up to a factor: by its length and its return."""
+        """(E,) float32, with what probability an episode is drawn, up to a factor: by its length, its weight, its return."""
         returns = self.episodes.returns - self.episodes.returns.min()
-        return th.from_numpy(self.episodes.lengths * (1.0 + return_weight * returns / (returns.max() or 1.0))).float()
+        by_return = 1.0 + return_weight * returns / (returns.max() or 1.0)
+        return th.from_numpy(self.weights * self.episodes.lengths * by_return).float()
 
     def _draw(
         self,

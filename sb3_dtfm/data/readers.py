@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -23,6 +24,8 @@ from sb3_dtfm.data.trajectories import DatasetError
 Dataset: TypeAlias = (
     str | os.PathLike[str] | MinariDataset | Mapping[str, Any] | Sequence[Any] | ReplayBuffer | TrajectoryBuffer
 )
+# What load_dataset itself does with a dataset of any kind.
+COMMON_OPTIONS = ("env_id", "action_space", "min_return", "best_share")
 
 
 class Reader(NamedTuple):
@@ -41,12 +44,44 @@ class Reader(NamedTuple):
     fingerprint: Callable[[Any, dict[str, Any]], Fingerprint] | None
 
 
+def is_several(dataset: Any) -> bool:
+    """Whether this is a list of datasets, and not of episodes."""
+    return is_episodes(dataset) and len(dataset) > 0 and all(_is_one_of_several(each) for each in dataset)
+
+
+def _is_one_of_several(dataset: Any) -> bool:
+    if is_mapping(dataset):
+        return "dataset" in dataset
+    return isinstance(dataset, str | os.PathLike | MinariDataset | ReplayBuffer | TrajectoryBuffer)
+
+
+def load_several(datasets: Sequence[Any], action_space: spaces.Box | None = None) -> TrajectoryBuffer:
+    """
+    Several datasets of one task as one, in memory.
+
+    :param datasets: anything that :func:`load_dataset` takes, or `{"dataset": it, "weight": 2.0, ...}` with its other
+        arguments; a step of one of weight 2 is learned from twice as often as one of weight 1
+    :param action_space: see :func:`load_dataset`
+    :raises DatasetError: one of them cannot be read, or is of another task; a weight that is no positive number
+    """
+    buffers, weights = [], []
+    for each in datasets:
+        options = dict(each) if is_mapping(each) else {"dataset": each}
+        dataset, weight = options.pop("dataset"), options.pop("weight", 1.0)
+        if not isinstance(weight, int | float) or not 0.0 < weight < math.inf:
+            raise DatasetError(f"dataset {dataset!s}: weight is {weight!r}; a positive number is accepted.")
+        buffers.append(load_dataset(dataset, **{"action_space": action_space, **options}))
+        weights.append(weight)
+    return TrajectoryBuffer.join(buffers, weights)
+
+
 # The first one that accepts a dataset reads it.
 READERS = (
     Reader("the path of a file of flat arrays (.npz, .hdf5)", is_flat_file, load_flat, fingerprint_flat_file),
     Reader("the path of a robomimic file (.hdf5)", is_robomimic, load_robomimic, fingerprint_robomimic),
     Reader("a Minari id (namespace/name-vN) or MinariDataset", is_minari, load_minari, fingerprint_minari),
     Reader("a dictionary of flat arrays", is_mapping, load_flat, None),
+    Reader("a list of datasets", is_several, load_several, None),
     Reader("a list of episodes", is_episodes, load_episodes, None),
     Reader("an SB3 ReplayBuffer", is_replay_buffer, load_replay_buffer, None),
     Reader("a TrajectoryBuffer", lambda dataset: isinstance(dataset, TrajectoryBuffer), lambda dataset: dataset, None),
@@ -58,6 +93,8 @@ def load_dataset(
     cache_dir: str | os.PathLike[str] | None = None,
     env_id: str | None = None,
     action_space: spaces.Box | None = None,
+    min_return: float | None = None,
+    best_share: float | None = None,
     **kwargs: Any,
 ) -> TrajectoryBuffer:
     """
@@ -65,11 +102,15 @@ def load_dataset(
 
     :param dataset: a Minari id (`namespace/name-vN`), an opened Minari dataset, the path of a robomimic hdf5 file, the path
         of flat arrays (`.npz`, or D4RL's hdf5) or a dictionary of them, see :func:`load_flat`, a list of episodes, see
-        :func:`load_episodes`, an SB3 replay buffer, see :func:`load_replay_buffer`, or a buffer, which is returned as it is
+        :func:`load_episodes`, an SB3 replay buffer, see :func:`load_replay_buffer`, a list of several datasets, see
+        :func:`load_several`, or a buffer, which is returned as it is
     :param cache_dir: learn from memory-mapped files in this folder, for datasets larger than memory; they are written at
         the first call and whenever the dataset has changed. None reads everything into memory
     :param env_id: Gymnasium id of the environment that the episodes count as coming from, whatever the dataset says
     :param action_space: the environment's, for data that do not tell of a range of actions
+    :param min_return: leave out episodes of a smaller return, environment reward units; of tasks that reward success with 1,
+        1 leaves the successes
+    :param best_share: keep this share of the episodes, those of the largest returns
     :param kwargs: options of the reader: `on_invalid`, which is "raise" unless "drop" leaves episodes out that would be
         refused, with a warning that names their number and the first reason; `filter_key` and `observation_keys` for
         robomimic files, see also :func:`load_flat`
@@ -79,7 +120,7 @@ def load_dataset(
     reader = _find_reader(dataset)
     own = [name for name in inspect.signature(reader.load).parameters if name not in ("storage", "action_space")][1:]
     given = kwargs if cache_dir is None else {**kwargs, "cache_dir": cache_dir}
-    accepted = [*own, *(["cache_dir"] if reader.fingerprint else []), "env_id", "action_space"]
+    accepted = [*own, *(["cache_dir"] if reader.fingerprint else []), *COMMON_OPTIONS]
     unknown = sorted(set(given) - set(accepted))
     if unknown:
         name = str(dataset) if reader.fingerprint else reader.kind
@@ -96,7 +137,7 @@ def load_dataset(
     if env_id is not None:
         buffer = copy.copy(buffer)
         buffer.env_id = env_id
-    return buffer
+    return buffer.best(min_return, best_share)
 
 
 def _find_reader(dataset: Any) -> Reader:

@@ -67,7 +67,11 @@ def train_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     offline = parser.add_argument_group(f"of {' and '.join(ALGORITHMS)}").add_argument
-    offline("--dataset", help="Minari id, robomimic hdf5 file, or .npz or hdf5 file of flat arrays to learn from")
+    offline(
+        "--dataset",
+        nargs="+",
+        help="Minari id, robomimic hdf5 file, or .npz or hdf5 file of flat arrays to learn from; or several",
+    )
     offline("--dataset-fraction", type=float, help="randomly drawn share of the episodes, in (0, 1]")
     offline("--dataset-cache", metavar="DIR", help="learn from memory-mapped files made in this folder")
     offline("--target-return", type=float, help="return to ask for when acting, in reward units")
@@ -148,8 +152,9 @@ def _shorthands(options: argparse.Namespace, given: dict[str, Any]) -> list[tupl
     """Pairs of an option that was given and its `key:value`, whose value RL-Zoo evaluates as Python."""
     wrapper = [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": options.target_return}}]
     cached = {**(given.get("dataset_kwargs") or {}), "cache_dir": options.dataset_cache}
+    dataset = options.dataset[0] if options.dataset and len(options.dataset) == 1 else options.dataset
     candidates = [
-        ("--dataset", "dataset", options.dataset, options.dataset),
+        ("--dataset", "dataset", dataset, dataset),
         ("--dataset-fraction", "dataset_fraction", options.dataset_fraction, options.dataset_fraction),
         ("--dataset-cache", "dataset_kwargs", options.dataset_cache, cached),
         ("--target-return", "env_wrapper", options.target_return, wrapper),

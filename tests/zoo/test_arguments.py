@@ -23,6 +23,11 @@ def zoo_reads(arguments: list[str]) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
+def test_several_datasets_are_a_list():
+    given = zoo_reads(train_arguments(["--algo", "dt", *ENV, "--dataset", "a.npz", "b/c-v0", "-n", "5"]))
+    assert given.hyperparams["dataset"] == ["a.npz", "b/c-v0"]
+
+
 @pytest.mark.parametrize("algo", ["dt", "dtfm"])
 def test_conf_file_defaults_to_the_paper_and_small_is_packaged(algo):
     assert zoo_reads(train_arguments(["--algo", algo, *ENV])).conf_file == str(packaged_config(algo))
