@@ -15,6 +15,7 @@ EXPECTED_ERRORS = (ValueError, TypeError, AssertionError, OSError, ImportError, 
 COMMANDS = {
     "train": "RL-Zoo's `train`, with dt and dtfm.",
     "enjoy": "RL-Zoo's `enjoy`, with dt and dtfm.",
+    "inspect": "Show what is in a dataset, and a return to ask for.",
     "record": "Make a dataset from a trained agent or a scripted demonstrator.",
     "demo": "Record, train and evaluate on robosuite's Lift, start to end.",
     "plot": "Draw the learning curve of a run of `train`.",

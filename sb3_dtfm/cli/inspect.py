@@ -1,0 +1,137 @@
+"""`sb3-dtfm inspect`: what is in a dataset, as a table and a picture, and a command to begin with."""
+
+import argparse
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sb3_dtfm.data import TrajectoryBuffer, load_dataset
+from sb3_dtfm.data.inspection import Inspection, Range, inspect_buffer
+from sb3_dtfm.zoo.arguments import key_values
+
+BLUE, RED, GREY = "#1b6ca8", "#c0562b", "0.6"
+# Episodes whose rewards are drawn.
+N_DRAWN = 50
+
+
+def main(argv: Sequence[str]) -> None:
+    """
+    Run `sb3-dtfm inspect`.
+
+    :param argv: its arguments
+    """
+    options = _parser().parse_args(argv)
+    dataset = options.dataset[0] if len(options.dataset) == 1 else options.dataset
+    buffer = load_dataset(dataset, **key_values("--dataset-kwargs", options.dataset_kwargs))
+    found = inspect_buffer(buffer)
+    print("\n".join(table(buffer, found)))
+    for remark in found.remarks:
+        print(f"- {remark}")
+    print(f"\nTo begin with:\n  {command(options.dataset, options.dataset_kwargs, buffer, found)}")
+    print(f"\nPicture: {draw(buffer, found, Path(options.output), ' + '.join(options.dataset))}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="sb3-dtfm inspect",
+        description="Show what is in a dataset, what may be wrong with it, and a return to ask for.",
+    )
+    argument = parser.add_argument
+    argument("dataset", nargs="+", metavar="DATASET", help="Minari id, robomimic file or flat arrays; or several")
+    argument("--dataset-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="options of its reader, as for train")
+    argument("-o", "--output", default="dataset.png", metavar="FILE", help="PNG to write; dataset.png by default")
+    return parser
+
+
+def table(buffer: TrajectoryBuffer, found: Inspection) -> list[str]:
+    """
+    :param buffer: the dataset
+    :param found: in it
+    :return: lines of Markdown
+    """
+    returns, lengths = buffer.episode_returns, buffer.episode_lengths
+    n_stopped = int((~buffer.terminated & ~buffer.truncated).sum())
+    ends = f"{buffer.terminated.sum()} terminated, {buffer.truncated.sum()} truncated, {n_stopped} just stop"
+    spread = f"{lengths.min():,} to {lengths.max():,}, {np.median(lengths):,.6g} in the median"
+    tenths = ", ".join(f"{each:,.6g}" for each in np.quantile(returns, (0.0, 0.1, 0.5, 0.9, 1.0)))
+    bounds = f"the space is {_interval(buffer.action_space.low, buffer.action_space.high)}, {found.at_bounds:.0%} at a bound"
+    rows = {
+        "task": buffer.env_id or "not said",
+        "episodes": f"{buffer.n_episodes:,}: {ends}",
+        "steps": f"{len(buffer):,}; an episode has {spread}",
+        "returns": f"{returns.mean():,.6g} on average; worst, 10 %, median, 90 %, best: {tenths}",
+        "observations": _numbers(found.observations),
+        "actions": f"{_numbers(found.actions)}; {bounds}",
+    }
+    return [f"| {buffer.source} | |", "| --- | --- |", *(f"| {name} | {what} |" for name, what in rows.items())]
+
+
+def _numbers(found: Range) -> str:
+    return f"{len(found.low)} numbers in {_interval(found.low, found.high)}"
+
+
+def _interval(low: np.ndarray, high: np.ndarray) -> str:
+    return f"[{low.min():.4g}, {high.max():.4g}]"
+
+
+def command(datasets: Sequence[str], dataset_kwargs: Sequence[str], buffer: TrajectoryBuffer, found: Inspection) -> str:
+    """
+    A training of this dataset.
+
+    :param datasets: as given
+    :param dataset_kwargs: as given
+    :param buffer: the dataset
+    :param found: in it
+    """
+    words = ["sb3-dtfm", "train", "--algo", "dtfm", "--env", buffer.env_id or "TASK", "--conf-file", "small"]
+    words += ["--dataset", *datasets, "--target-return", f"{found.target_return:g}"]
+    if dataset_kwargs:
+        inside = ", ".join("=".join(text.split(":", 1)) for text in dataset_kwargs)
+        words += ["-params", f"dataset_kwargs:dict({inside})"]
+    return shlex.join(words)
+
+
+def draw(buffer: TrajectoryBuffer, found: Inspection, output: Path, title: str) -> Path:
+    """
+    Draw returns, lengths, rewards over time, and the actions' ranges.
+
+    :param buffer: the dataset
+    :param found: in it
+    :param output: PNG file to write
+    :param title: heading
+    :return: `output`
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 6.2), layout="constrained")
+    (returns, lengths), (over_time, actions) = figure.subplots(2, 2)
+    n_bins = min(50, max(10, buffer.n_episodes // 4))
+    returns.hist(buffer.episode_returns, bins=n_bins, color=BLUE)
+    returns.axvline(found.target_return, color=RED, linestyle="--")
+    returns.set_title(f"to ask for: {found.target_return:,g}", color=RED, fontsize="medium")
+    returns.set(xlabel="return of an episode", ylabel="episodes")
+    lengths.hist(buffer.episode_lengths, bins=n_bins, color=BLUE)
+    lengths.set(xlabel="steps of an episode", ylabel="episodes")
+    order = np.argsort(buffer.episode_returns)
+    chosen = order[np.linspace(0, len(order) - 1, min(N_DRAWN, len(order))).astype(int)]
+    for episode in chosen:
+        some = buffer.select(np.array([episode]))
+        over_time.plot(some.returns_to_go[some.rows].cpu().numpy(), color=BLUE, alpha=0.35, linewidth=1.0)
+    over_time.set(xlabel="step", ylabel="return-to-go")
+    dimensions = np.arange(len(found.actions.low))
+    space = buffer.action_space
+    actions.vlines(dimensions, space.low, space.high, color="0.9", linewidth=8.0, label="action space")
+    actions.vlines(dimensions, found.actions.low, found.actions.high, color=GREY, linewidth=3.0, label="used")
+    spread = (found.actions.mean + sign * found.actions.std for sign in (-1.0, 1.0))
+    spread = (np.clip(each, found.actions.low, found.actions.high) for each in spread)
+    actions.vlines(dimensions, *spread, color=BLUE, linewidth=5.0, label="usual")
+    actions.set(xlabel="dimension of the action", ylabel="action", xticks=dimensions if len(dimensions) <= 24 else [])
+    actions.legend(frameon=False, fontsize="small", loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
+    for axis in (returns, lengths, over_time, actions):
+        axis.spines[["top", "right"]].set_visible(False)
+    figure.suptitle(title)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(output, dpi=130)
+    return output

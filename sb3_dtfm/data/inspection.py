@@ -1,0 +1,132 @@
+"""What is in a buffer, and what a user should know of it before training."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch as th
+
+from sb3_dtfm.data.buffer import TrajectoryBuffer
+
+# Below this share of the range of actions that the data use, learning is in a corner of it.
+NARROW = 0.1
+# Actions this near to a bound, as a share of the range, are at it; worth a word if they are this share of all.
+AT_BOUND, MANY = 1e-3, 0.5
+# Standard deviations from the mean at which a number is no measurement any more.
+FAR = 100.0
+FEW_EPISODES = 20
+# Whose mean return is to be asked for.
+BEST_SHARE = 0.1
+
+
+class Range(NamedTuple):
+    """Of each dimension (D,): smallest and largest number, mean and standard deviation."""
+
+    low: np.ndarray
+    high: np.ndarray
+    mean: np.ndarray
+    std: np.ndarray
+
+
+class Inspection(NamedTuple):
+    """
+    What was found.
+
+    :param observations: of O dimensions
+    :param actions: of A dimensions, in the environment's range
+    :param at_bounds: share of all actions' entries at a bound of the action space
+    :param target_return: to ask for: the mean return of the best tenth of the episodes, four digits
+    :param remarks: sentences about what may be wrong
+    """
+
+    observations: Range
+    actions: Range
+    at_bounds: float
+    target_return: float
+    remarks: list[str]
+
+
+def inspect_buffer(buffer: TrajectoryBuffer) -> Inspection:
+    """
+    Look at every step.
+
+    :param buffer: as it would be learned from
+    """
+    rows = buffer.rows
+    observations = _range(buffer.observations.index_select(0, rows))
+    values = buffer.actions.index_select(0, rows)
+    actions = _range(values)
+    low, high = (th.from_numpy(bound).to(values) for bound in (buffer.action_space.low, buffer.action_space.high))
+    margin = AT_BOUND * (high - low)
+    at_bounds = float(((values <= low + margin) | (values >= high - margin)).float().mean())
+    best = buffer.best(best_share=BEST_SHARE).episode_returns.mean()
+    remarks = [*_of_episodes(buffer), *_of_observations(observations), *_of_actions(buffer, actions, at_bounds)]
+    return Inspection(observations, actions, at_bounds, float(f"{best:.4g}"), remarks)
+
+
+def _range(values: th.Tensor) -> Range:
+    numbers = values.cpu().numpy()
+    mean = numbers.mean(axis=0, dtype=np.float64)
+    return Range(numbers.min(axis=0), numbers.max(axis=0), mean, numbers.std(axis=0, dtype=np.float64))
+
+
+def _of_episodes(buffer: TrajectoryBuffer) -> list[str]:
+    n, lengths, returns = buffer.n_episodes, buffer.episode_lengths, buffer.episode_returns
+    table = np.column_stack([lengths, returns, buffer.episodes.observation_means])
+    n_twice = n - len(np.unique(table, axis=0))
+    n_stopped = int((~buffer.terminated & ~buffer.truncated).sum())
+    n_short = int((lengths == 1).sum())
+    remarks = []
+    if n < FEW_EPISODES:
+        remarks.append(f"There are {_count(n, 'episode')}: what is learned depends on which ones.")
+    if n_twice:
+        remarks.append(f"There twice: {_count(n_twice, 'episode')} of {n}.")
+    if n_short:
+        remarks.append(f"Of a single step: {_count(n_short, 'episode')} of {n}.")
+    if n_stopped:
+        remarks.append(f"Neither terminated nor truncated, the recording just stops: {_count(n_stopped, 'episode')} of {n}.")
+    if buffer.n_dropped:
+        remarks.append(f"Left out, since they cannot be used: {_count(buffer.n_dropped, 'episode')}.")
+    if not returns.any():
+        remarks.append("No episode has any return, so that asking for one says nothing.")
+    elif np.ptp(returns) == 0:
+        remarks.append(f"All returns are {returns[0]:g}: the policy copies what it sees, whatever it is asked for.")
+    return remarks
+
+
+def _of_observations(found: Range) -> list[str]:
+    remarks = []
+    still = np.flatnonzero(found.low == found.high)
+    if len(still):
+        remarks.append(f"Observations never change in {_dimensions(still)}.")
+    moving = found.std > 0
+    distance = np.zeros(len(found.std))
+    extremes = np.maximum(found.high - found.mean, found.mean - found.low)
+    distance[moving] = extremes[moving] / found.std[moving]
+    if (distance > FAR).any():
+        worst = int(distance.argmax())
+        what = f"{distance[worst]:.0f} standard deviations from the mean"
+        remarks.append(f"Observations go far out in {_dimensions(np.flatnonzero(distance > FAR))}: in {worst}, {what}.")
+    return remarks
+
+
+def _of_actions(buffer: TrajectoryBuffer, found: Range, at_bounds: float) -> list[str]:
+    space, remarks = buffer.action_space, []
+    used = (found.high - found.low) / (space.high - space.low)
+    still, narrow = np.flatnonzero(used == 0), np.flatnonzero((used > 0) & (used < NARROW))
+    if len(still):
+        remarks.append(f"Actions never change in {_dimensions(still)}.")
+    if len(narrow):
+        share = f"less than {NARROW:.0%} of the action space's range"
+        remarks.append(f"Actions use {share} in {_dimensions(narrow)}: is it the range of these data?")
+    if at_bounds > MANY:
+        remarks.append(f"{at_bounds:.0%} of the actions are at a bound.")
+    return remarks
+
+
+def _dimensions(indices: np.ndarray) -> str:
+    shown = ", ".join(map(str, indices[:8])) + (" ..." if len(indices) > 8 else "")
+    return f"dimension{'s' if len(indices) > 1 else ''} {shown}"
+
+
+def _count(n: int, what: str) -> str:
+    return f"{n} {what}{'s' if n != 1 else ''}"

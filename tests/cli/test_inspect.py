@@ -1,0 +1,95 @@
+"""What is in a dataset: real recordings, and arrays of which every fault is known."""
+
+import shlex
+
+import numpy as np
+
+from sb3_dtfm.cli.main import main
+from sb3_dtfm.data import load_dataset
+from sb3_dtfm.data.inspection import inspect_buffer
+from sb3_dtfm.zoo.arguments import train_arguments
+from tests.recorded import DATASET_ID
+
+
+def arrays(n_episodes=30, n_steps=4):
+    """Observations are normal numbers, actions use half of the range, returns are 0 to 29."""
+    rng = np.random.default_rng(0)
+    n = n_episodes * n_steps
+    return {
+        "observations": rng.normal(size=(n, 3)), "actions": rng.uniform(-0.5, 0.5, (n, 2)),
+        "rewards": np.repeat(np.arange(n_episodes) / n_steps, n_steps),
+        "episode_lengths": [n_steps] * n_episodes, "terminals": np.arange(1, n + 1) % n_steps == 0,
+    }  # fmt: skip
+
+
+def test_numbers_of_good_data_and_nothing_to_remark():
+    given = arrays()
+    found = inspect_buffer(load_dataset(given))
+    assert found.remarks == []
+    assert found.target_return == 28.0  # the mean of 27, 28 and 29
+    assert found.at_bounds == 0.0
+    np.testing.assert_allclose(found.actions.high, given["actions"].max(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(found.observations.std, given["observations"].std(axis=0), rtol=1e-6)
+
+
+def test_every_fault_is_remarked():
+    given = arrays(12)
+    given["observations"][:, 1] = 7.0
+    given["observations"] = np.hstack([given["observations"], np.zeros((48, 1))])
+    given["actions"][:, 0] = 0.0
+    given["actions"][:, 1] *= 0.01
+    given["rewards"][:] = 0.0
+    given["terminals"][-1] = False
+    for name in ("observations", "actions"):
+        given[name][4:8] = given[name][:4]
+    remarks = inspect_buffer(load_dataset(given)).remarks
+    assert remarks == [
+        "There are 12 episodes: what is learned depends on which ones.",
+        "There twice: 1 episode of 12.",
+        "Neither terminated nor truncated, the recording just stops: 1 episode of 12.",
+        "No episode has any return, so that asking for one says nothing.",
+        "Observations never change in dimensions 1, 3.",
+        "Actions never change in dimension 0.",
+        "Actions use less than 10% of the action space's range in dimension 1: is it the range of these data?",
+    ]
+    far = arrays(3_000)
+    far["observations"][5, 2], far["actions"] = 1e6, np.sign(far["actions"])
+    far["rewards"][:] = 1.0
+    assert inspect_buffer(load_dataset(far)).remarks == [
+        "All returns are 4: the policy copies what it sees, whatever it is asked for.",
+        "Observations go far out in dimension 2: in 2, 110 standard deviations from the mean.",
+        "100% of the actions are at a bound.",
+    ]
+
+
+def test_the_command_shows_a_table_a_picture_and_a_command_that_trains(workplace, capsys):
+    assert main(["inspect", DATASET_ID, "-o", "figures/found.png"]) == 0
+    text = capsys.readouterr().out
+    rows = dict(
+        line.strip("| ").split(" | ", 1)
+        for line in text.splitlines()
+        if line.startswith("| ")
+        if not line.startswith("| Minari")
+    )
+    assert rows["task"] == "HalfCheetah-v5"
+    assert rows["episodes"] == "3: 0 terminated, 3 truncated, 0 just stop"
+    assert rows["steps"].startswith("3,000; an episode has 1,000 to 1,000, 1,000 in the median")
+    assert (workplace / "figures" / "found.png").stat().st_size > 10_000
+    command = shlex.split(text.split("To begin with:\n")[1].splitlines()[0])
+    assert command[:2] == ["sb3-dtfm", "train"]
+    assert main([*command[1:], "-n", "2", "--eval-freq", "-1", "--verbose", "0"]) == 0
+
+
+def test_options_of_the_reader_and_several_datasets(workplace, capsys):
+    np.savez("a.npz", **arrays())
+    np.savez("b.npz", **arrays(5))
+    assert main(["inspect", "a.npz", "b.npz", "--dataset-kwargs", "min_return:2"]) == 0
+    text = capsys.readouterr().out
+    assert "| episodes | 31: 31 terminated" in text
+    command = text.split("To begin with:\n")[1].splitlines()[0]
+    assert "--env TASK" in command
+    given = train_arguments(shlex.split(command.replace("TASK", "Pendulum-v1"))[2:])
+    assert "dataset_kwargs:dict(min_return=2)" in given
+    assert "dataset:['a.npz', 'b.npz']" in given
+    assert main(["inspect", "none.npz"]) == 2
+    assert "none.npz does not exist" in capsys.readouterr().err
