@@ -4,6 +4,7 @@ from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.episodes import Statistics
 from sb3_dtfm.data.flat import load_flat
 from sb3_dtfm.data.in_memory import load_episodes, load_replay_buffer
+from sb3_dtfm.data.lerobot import load_lerobot
 from sb3_dtfm.data.minari import load_minari
 from sb3_dtfm.data.readers import Dataset, load_dataset
 from sb3_dtfm.data.robomimic import load_robomimic
@@ -20,6 +21,7 @@ __all__ = [
     "load_dataset",
     "load_episodes",
     "load_flat",
+    "load_lerobot",
     "load_minari",
     "load_replay_buffer",
     "load_robomimic",

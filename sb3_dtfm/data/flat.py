@@ -60,13 +60,22 @@ def fingerprint_flat_file(path: str | os.PathLike[str], options: dict[str, Any])
     :raises DatasetError: no such file
     """
     path = existing_file(path, EXPECTED)
+    return Fingerprint.of(path.name, path, json_options(options))
+
+
+def json_options(options: dict[str, Any]) -> dict[str, Any]:
+    """
+    Options of a reader as JSON can hold them: arrays become lists.
+
+    :param options: `action_bounds` or `action_space` among them
+    """
     options = dict(options)
     space = options.pop("action_space", None)
     if "action_bounds" not in options and space is not None:
         options["action_bounds"] = (space.low, space.high)
-    if options.get("action_bounds") is not None:  # arrays become lists, as JSON can hold them
+    if options.get("action_bounds") is not None:
         options["action_bounds"] = [np.asarray(bound).tolist() for bound in options["action_bounds"]]
-    return Fingerprint.of(path.name, path, options)
+    return options
 
 
 def load_flat(

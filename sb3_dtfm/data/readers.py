@@ -16,6 +16,7 @@ from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, load_cached
 from sb3_dtfm.data.flat import fingerprint_flat_file, is_flat_file, is_mapping, load_flat
 from sb3_dtfm.data.in_memory import is_episodes, is_replay_buffer, load_episodes, load_replay_buffer
+from sb3_dtfm.data.lerobot import fingerprint_lerobot, is_lerobot, load_lerobot
 from sb3_dtfm.data.minari import fingerprint_minari, is_minari, load_minari
 from sb3_dtfm.data.robomimic import fingerprint_robomimic, is_robomimic, load_robomimic
 from sb3_dtfm.data.trajectories import DatasetError
@@ -78,6 +79,7 @@ def load_several(datasets: Sequence[Any], action_space: spaces.Box | None = None
 # The first one that accepts a dataset reads it.
 READERS = (
     Reader("the path of a file of flat arrays (.npz, .hdf5)", is_flat_file, load_flat, fingerprint_flat_file),
+    Reader("the path of a LeRobot dataset (a folder)", is_lerobot, load_lerobot, fingerprint_lerobot),
     Reader("the path of a robomimic file (.hdf5)", is_robomimic, load_robomimic, fingerprint_robomimic),
     Reader("a Minari id (namespace/name-vN) or MinariDataset", is_minari, load_minari, fingerprint_minari),
     Reader("a dictionary of flat arrays", is_mapping, load_flat, None),
@@ -100,10 +102,10 @@ def load_dataset(
     """
     Read recorded episodes from wherever they are.
 
-    :param dataset: a Minari id (`namespace/name-vN`), an opened Minari dataset, the path of a robomimic hdf5 file, the path
-        of flat arrays (`.npz`, or D4RL's hdf5) or a dictionary of them, see :func:`load_flat`, a list of episodes, see
-        :func:`load_episodes`, an SB3 replay buffer, see :func:`load_replay_buffer`, a list of several datasets, see
-        :func:`load_several`, or a buffer, which is returned as it is
+    :param dataset: a Minari id (`namespace/name-vN`), an opened Minari dataset, the path of a robomimic hdf5 file; flat
+        arrays, as the path of an `.npz` or of D4RL's hdf5, or a dictionary, see :func:`load_flat`; the folder of a LeRobot
+        dataset, see :func:`load_lerobot`; a list of episodes, see :func:`load_episodes`; an SB3 replay buffer, see
+        :func:`load_replay_buffer`; a list of several datasets, see :func:`load_several`; a buffer, which is returned as it is
     :param cache_dir: learn from memory-mapped files in this folder, for datasets larger than memory; they are written at
         the first call and whenever the dataset has changed. None reads everything into memory
     :param env_id: Gymnasium id of the environment that the episodes count as coming from, whatever the dataset says

@@ -1,0 +1,182 @@
+"""Reading LeRobot datasets, folders of parquet files, into a `TrajectoryBuffer`."""
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet
+from gymnasium import spaces
+
+from sb3_dtfm.data.buffer import TrajectoryBuffer
+from sb3_dtfm.data.cache import Fingerprint
+from sb3_dtfm.data.flat import bounded_space, clipped, json_options
+from sb3_dtfm.data.storage import FileStorage
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_real, check_size, naming
+
+INFO, DATA = "meta/info.json", "data"
+ACTION, REWARD, SUCCESS, DONE = "action", "next.reward", "next.success", "next.done"
+EPISODE, FRAME = "episode_index", "frame_index"
+OBSERVATION = "observation."
+# What numbers of a robot are stored as; images, videos and words are others.
+NUMBERS = ("float32", "float64", "float16", "int64", "int32", "bool")
+
+
+def is_lerobot(dataset: Any) -> bool:
+    """Whether this is the path of such a folder."""
+    return isinstance(dataset, str | os.PathLike) and (Path(dataset).expanduser() / INFO).is_file()
+
+
+def fingerprint_lerobot(path: str | os.PathLike[str], options: dict[str, Any]) -> Fingerprint:
+    """
+    Of a folder as it is now.
+
+    :param path: the folder
+    :param options: of :func:`load_lerobot`
+    """
+    path = Path(path).expanduser()
+    return Fingerprint.of(path.name, path, json_options(options))
+
+
+def load_lerobot(
+    path: str | os.PathLike[str],
+    observation_keys: Sequence[str] | None = None,
+    action_bounds: Sequence[Any] | None = None,
+    clip_actions: bool = False,
+    action_space: spaces.Box | None = None,
+    on_invalid: str = "raise",
+    storage: FileStorage | None = None,
+) -> TrajectoryBuffer:
+    """
+    The episodes of a LeRobot dataset, of its formats 2.0 to 3.0: `meta/info.json`, and parquet files below `data`.
+
+    The observation is made of all vectors of numbers whose names begin with `observation.`, in the order of their names;
+    images and videos are left out. Rewards are `next.reward`, or else 1 at the first step of `next.success`, or else 1 at
+    the last step of every episode. The numbers of all episodes are read into memory.
+
+    :param path: the folder
+    :param observation_keys: which features make up the observation, in this order, as `observation.state`
+    :param action_bounds: smallest and largest action, numbers or (A,) each; where they are not given, those of
+        `action_space`, or what has been recorded
+    :param clip_actions: bring actions outside of them to the nearest bound, however far, instead of refusing them
+    :param action_space: the environment's
+    :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
+    :param storage: where the steps go, memory if not given
+    :raises DatasetError: files missing or damaged, other numbers of episodes or frames than `meta/info.json` tells of, NaN
+        or infinity, or actions out of bounds; names the folder, the feature, the episode and the step
+    """
+    folder = Path(path).expanduser()
+    source = str(folder)
+    with naming(f"{source}: {INFO}"):
+        info = json.loads((folder / INFO).read_text())
+        features = {name: tuple(each["shape"]) for name, each in info["features"].items() if each["dtype"] in NUMBERS}
+        told = {"total_frames": int(info["total_frames"]), "total_episodes": int(info["total_episodes"])}
+    keys = list(observation_keys or sorted(name for name in features if name.startswith(OBSERVATION)))
+    for name in (*keys, ACTION):
+        if name not in features:
+            raise DatasetError(f"{source}: has no feature {name!r} of numbers, only {', '.join(sorted(features))}.")
+    if not keys:
+        raise DatasetError(
+            f"{source}: no feature of numbers begins with {OBSERVATION!r}, only {', '.join(sorted(features))}."
+        )
+    labels = [name for name in (REWARD, SUCCESS, DONE) if name in features]
+    columns, n_stored = _read(folder, [*keys, ACTION, *labels, EPISODE, FRAME], told["total_frames"], source)
+    order = np.lexsort((columns[FRAME][:, 0], columns[EPISODE][:, 0]))
+    columns = {name: values[order] for name, values in columns.items()}
+    numbers, starts = np.unique(columns[EPISODE][:, 0], return_index=True)
+    stops = np.append(starts[1:], len(order))
+    if len(numbers) != told["total_episodes"]:
+        told_of = f"{INFO} tells of {told['total_episodes']} episodes"
+        raise DatasetError(f"{source}: {told_of}; there are {len(numbers)}.")
+    actions = columns[ACTION]
+    if action_bounds is None and action_space is None:
+        action_bounds = _recorded(actions)
+    space = bounded_space(action_bounds, action_space, actions.shape[1], source)
+    observations = np.concatenate([columns[key] for key in keys], axis=1)
+    actions = clipped(actions, space) if clip_actions else actions
+
+    def trajectory(number: int, start: int, stop: int) -> Trajectory:
+        steps = slice(start, stop)
+        frames = columns[FRAME][steps, 0]
+        if not np.array_equal(frames, np.arange(stop - start)):
+            raise DatasetError(f"{source}, episode {number}: {FRAME} does not count its {stop - start} frames from 0 on.")
+        success = columns[SUCCESS][steps, 0] > 0 if SUCCESS in columns else None
+        if REWARD in columns:
+            rewards = columns[REWARD][steps, 0]
+            ended = success if success is not None else columns.get(DONE, np.zeros((len(order), 1)))[steps, 0]
+            terminated = bool(ended[-1])
+        else:
+            marks = np.eye(1, stop - start, stop - start - 1)[0] if success is None else success
+            terminated = bool(marks.any())
+            steps = slice(start, start + int(np.argmax(marks)) + 1 if terminated else stop)
+            rewards = marks[: steps.stop - start].astype(float)
+        return Trajectory(
+            observations=observations[steps],
+            actions=actions[steps],
+            rewards=rewards,
+            terminated=terminated,
+            truncated=not terminated,
+            name=f"episode {number}",
+        )
+
+    return TrajectoryBuffer.from_trajectories(
+        map(trajectory, map(int, numbers), map(int, starts), map(int, stops)),
+        space,
+        n_steps=len(order),
+        source=source,
+        storage=storage,
+        on_invalid=on_invalid,
+        n_stored=n_stored,
+    )
+
+
+def _read(folder: Path, names: Sequence[str], n_frames: int, source: str) -> tuple[dict[str, np.ndarray], int]:
+    """
+    The columns of all parquet files, (N, .) each, and how many bytes are stored of them.
+
+    :param names: of the columns
+    :param n_frames: N, as the dataset tells
+    """
+    paths = sorted((folder / DATA).rglob("*.parquet"))
+    if not paths:
+        raise DatasetError(f"{source}: there is no parquet file below {DATA}.")
+    n_stored = sum(path.stat().st_size for path in paths)
+    parts: list[dict[str, np.ndarray]] = []
+    n_found = 0
+    for path in paths:
+        with naming(str(path)), pyarrow.parquet.ParquetFile(path) as file:
+            missing = sorted(set(names) - set(file.schema_arrow.names))
+            if missing:
+                raise DatasetError(f"{path}: has no column {', '.join(missing)}.")
+            n_found += file.metadata.num_rows
+            check_size(8 * n_found * len(names), n_stored, f"{source}: {n_found} frames")
+            table = file.read(columns=list(names))
+            table.validate(full=True)
+            parts.append({name: _numbers(table[name].combine_chunks(), f"{path}: {name}") for name in names})
+    if n_found != n_frames:
+        raise DatasetError(f"{source}: {INFO} tells of {n_frames} frames; there are {n_found}.")
+    with naming(source):
+        return {name: np.concatenate([part[name] for part in parts]) for name in names}, n_stored
+
+
+def _numbers(values: Any, where: str) -> np.ndarray:
+    """A column as (N, .), whose entries are numbers or lists of as many."""
+    n_rows = len(values)
+    if pyarrow.types.is_list(values.type) or pyarrow.types.is_fixed_size_list(values.type):
+        sizes = np.unique(np.diff(values.offsets.to_numpy())) if pyarrow.types.is_list(values.type) else np.zeros(1)
+        if len(sizes) > 1:
+            raise DatasetError(f"{where} holds lists of {sizes[0]} to {sizes[-1]} numbers; one length is expected.")
+        values = values.flatten()
+    array = values.to_numpy(zero_copy_only=False)
+    check_real(array.dtype, where)
+    return array.reshape(n_rows, -1)
+
+
+def _recorded(actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest and largest action of each dimension; 1 around one that never changes."""
+    with np.errstate(invalid="ignore"):
+        low, high = np.nanmin(actions, axis=0), np.nanmax(actions, axis=0)
+    still = low == high
+    return low - still, high + still

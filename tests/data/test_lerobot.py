@@ -1,0 +1,122 @@
+"""LeRobot's folders: written as its formats 2.1 and 3.0 describe them."""
+
+import json
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from gymnasium import spaces
+
+from sb3_dtfm import DT
+from sb3_dtfm.data import DatasetError, load_dataset
+
+LENGTHS = [3, 5, 4]
+
+
+def columns(**changes):
+    """Three episodes, actions in degrees; None leaves a column out."""
+    rng = np.random.default_rng(0)
+    n = sum(LENGTHS)
+    found = {
+        "observation.state": rng.normal(size=(n, 3)), "observation.environment_state": rng.normal(size=(n, 2)),
+        "action": rng.uniform(-90, 90, (n, 2)), "timestamp": np.arange(n) / 30,
+        "frame_index": np.concatenate([np.arange(length) for length in LENGTHS]),
+        "episode_index": np.repeat(np.arange(3), LENGTHS), "index": np.arange(n), "task_index": np.zeros(n, int),
+    }  # fmt: skip
+    return {name: values for name, values in {**found, **changes}.items() if values is not None}
+
+
+def write(folder, version="v2.1", info=None, **changes):
+    """One file an episode, as in 2.1, or one for all, as in 3.0."""
+    found = columns(**changes)
+    episodes = found["episode_index"]
+    features = {name: {"dtype": str(v.dtype), "shape": list(v.shape[1:]) or [1], "names": None} for name, v in found.items()}
+    features["observation.images.top"] = {"dtype": "video", "shape": [480, 640, 3], "names": ["height", "width", "channel"]}
+    told = {"codebase_version": version, "total_frames": len(episodes), "total_episodes": 3, "fps": 30, "features": features}
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps({**told, **(info or {})}))
+    data = folder / "data" / "chunk-000"
+    data.mkdir(parents=True)
+    for episode in np.unique(episodes) if version == "v2.1" else [None]:
+        chosen = np.flatnonzero(episodes == episode) if episode is not None else np.arange(len(episodes))
+        table = pa.table({name: list(values[chosen]) for name, values in found.items()})
+        name = f"file-{0:03d}" if episode is None else f"episode_{episode:06d}"
+        pq.write_table(table, data / f"{name}.parquet")
+    return str(folder)
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_episodes_are_what_was_written(version, tmp_path):
+    found = columns()
+    buffer = load_dataset(write(tmp_path / "arm", version))
+    assert buffer.episode_lengths.tolist() == LENGTHS
+    expected = np.hstack([found["observation.environment_state"], found["observation.state"]])
+    np.testing.assert_array_equal(buffer.observations, expected.astype(np.float32))
+    np.testing.assert_array_equal(buffer.actions, found["action"].astype(np.float32))
+    np.testing.assert_array_equal(buffer.action_space.high, found["action"].max(axis=0).astype(np.float32))
+    assert buffer.rewards.tolist() == [0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 1]
+    assert buffer.terminated.all()
+    chosen = load_dataset(tmp_path / "arm", observation_keys=["observation.state"], action_space=spaces.Box(-180, 180, (2,)))
+    assert (chosen.observation_space.shape, chosen.action_space.high[0]) == ((3,), 180)
+    cached = load_dataset(tmp_path / "arm", cache_dir=tmp_path / "cache", action_bounds=(-90, 90))
+    np.testing.assert_array_equal(cached.observations, buffer.observations)
+    assert DT("MultiInputPolicy", dataset=str(tmp_path / "arm"), device="cpu").buffer.n_episodes == 3
+
+
+def test_rewards_and_successes(tmp_path):
+    success = np.zeros(12, bool)
+    success[[1, 7]] = True
+    buffer = load_dataset(write(tmp_path / "successes", **{"next.success": success}))
+    assert buffer.episode_lengths.tolist() == [2, 5, 4]
+    assert buffer.episode_returns.tolist() == [1, 1, 0]
+    assert buffer.terminated.tolist() == [True, True, False]
+    assert buffer.truncated.tolist() == [False, False, True]
+    both = {"next.success": success, "next.reward": np.arange(12.0), "next.done": np.ones(12, bool)}
+    buffer = load_dataset(write(tmp_path / "both", **both))
+    assert buffer.episode_returns.tolist() == [3, 25, 38]
+    assert buffer.terminated.tolist() == [False, True, False]
+    ended = {"next.reward": np.arange(12.0), "next.done": np.array([0] * 11 + [1], bool)}
+    assert load_dataset(write(tmp_path / "ended", **ended)).terminated.tolist() == [False, False, True]
+
+
+UNFIT = {
+    "no action": (dict(action=None), "has no feature 'action' of numbers, only episode_index"),
+    "no vectors": (
+        {"observation.state": None, "observation.environment_state": None},
+        "no feature of numbers begins with 'observation.', only action",
+    ),
+    "frames": (dict(frame_index=np.arange(12)), "episode 1: frame_index does not count its 5 frames from 0 on"),
+    "other frames than told": (dict(info={"total_frames": 13}), "info.json tells of 13 frames; there are 12"),
+    "other episodes than told": (dict(info={"total_episodes": 4}), "info.json tells of 4 episodes; there are 3"),
+    "NaN": (dict(action=np.full((12, 2), np.nan)), "episode 0, step 0: actions hold nan"),
+    "no features": (dict(info={"features": 3}), "info.json: cannot be read"),
+}
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+@pytest.mark.parametrize(("changes", "message"), UNFIT.values(), ids=UNFIT)
+def test_what_does_not_fit_is_refused_by_name(changes, message, version, tmp_path):
+    path = write(tmp_path / "arm", version, **changes)
+    with pytest.raises(DatasetError, match=f"arm.*{message}"):
+        load_dataset(path, action_bounds=(-90, 90))
+
+
+def test_damaged_files(tmp_path):
+    path = tmp_path / "arm"
+    write(path, "v3.0")
+    (file,) = (path / "data" / "chunk-000").iterdir()
+    content = file.read_bytes()
+    pq.write_table(pa.table({"action": [[1.0], [1.0, 2.0]]}), file)
+    with pytest.raises(DatasetError, match=r"file-000.parquet: has no column episode_index, frame_index, observation"):
+        load_dataset(path)
+    table = pq.read_table(pa.BufferReader(content)).drop_columns("action")
+    pq.write_table(table.append_column("action", [[[1.0]] * 11 + [[1.0, 2.0]]]), file)
+    with pytest.raises(DatasetError, match=r"action holds lists of 1 to 2 numbers; one length is expected"):
+        load_dataset(path)
+    file.write_bytes(content[:-100])
+    with pytest.raises(DatasetError, match=r"file-000.parquet: cannot be read"):
+        load_dataset(path)
+    file.unlink()
+    with pytest.raises(DatasetError, match=r"arm: there is no parquet file below data"):
+        load_dataset(path)
