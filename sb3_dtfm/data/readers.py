@@ -105,7 +105,7 @@ def load_dataset(
     :param dataset: a Minari id (`namespace/name-vN`), an opened Minari dataset, the path of a robomimic hdf5 file; flat
         arrays, as the path of an `.npz` or of D4RL's hdf5, or a dictionary, see :func:`load_flat`; the folder of a LeRobot
         dataset, see :func:`load_lerobot`; a list of episodes, see :func:`load_episodes`; an SB3 replay buffer, see
-        :func:`load_replay_buffer`; a list of several datasets, see :func:`load_several`; a buffer, which is returned as it is
+        :func:`load_replay_buffer`; a list of several datasets, see :func:`load_several`; a buffer, which stays as it is
     :param cache_dir: learn from memory-mapped files in this folder, for datasets larger than memory; they are written at
         the first call and whenever the dataset has changed. None reads everything into memory
     :param env_id: Gymnasium id of the environment that the episodes count as coming from, whatever the dataset says
