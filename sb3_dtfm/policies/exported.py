@@ -50,8 +50,8 @@ class ExportedPolicy(nn.Module):
             hidden = trunk(**windows._asdict(), last_only=True).squeeze(1)
         else:
             memory = F.pad(keys_values, (0, 0, 0, trunk.tokens_per_step))
-            hidden = trunk.extend(**windows._asdict(), keys_values=memory)
-            kept = (memory[..., trunk.tokens_per_step :, :],)
+            hidden, filled = trunk.extend(**windows._asdict(), keys_values=memory)
+            kept = (th.stack(filled, dim=1)[..., trunk.tokens_per_step :, :],)
         if noise is not None:
             rows = (timesteps[:, -1] + episode_keys) % len(self.noise_table)
             noise = th.where(noise.any(dim=1, keepdim=True), noise, self.noise_table[rows])
