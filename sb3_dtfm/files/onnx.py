@@ -63,8 +63,8 @@ def _graph(module: nn.Module, inputs: dict[str, th.Tensor], outputs: list[str]) 
     rows = {name: {0: th.export.Dim("batch")} for name in inputs}
     # Captured here, by the one way whose graph is for all inputs: left alone, the exporter tries others if that one fails.
     program = th.export.export(module, (), kwargs=inputs, dynamic_shapes=rows, strict=False)
-    names = {"input_names": list(inputs), "output_names": outputs, "dynamic_shapes": rows}
-    return th.onnx.export(program, **names, opset_version=OPSET, dynamo=True, verbose=False)
+    names: dict[str, Any] = {"input_names": list(inputs), "output_names": outputs, "dynamic_shapes": rows}
+    return th.onnx.export(program, opset_version=OPSET, dynamo=True, verbose=False, **names)
 
 
 @contextlib.contextmanager

@@ -42,9 +42,7 @@ class TransformerBlock(nn.Module):
             key, value = F.linear(normed, weight[width:], bias[width:]).split(width, dim=-1)
         return self._finish(tokens[:, queries], query, key, value, attention_bias[:, :, queries])
 
-    def extend(
-        self, tokens: th.Tensor, keys_values: th.Tensor, attention_bias: th.Tensor
-    ) -> tuple[th.Tensor, th.Tensor]:
+    def extend(self, tokens: th.Tensor, keys_values: th.Tensor, attention_bias: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         Compute new tokens only, from the keys and values of all.
 

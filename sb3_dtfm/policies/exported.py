@@ -7,7 +7,8 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_dtfm.policies.sequence import SequencePolicy
+from sb3_dtfm.policies.normalization import Normalization
+from sb3_dtfm.policies.sequence import SequenceNetwork, SequencePolicy
 from sb3_dtfm.windows import Windows
 
 
@@ -25,7 +26,8 @@ class ExportedPolicy(nn.Module):
 
     def __init__(self, policy: SequencePolicy) -> None:
         super().__init__()
-        self.normalization, self.network = (copy.deepcopy(x).cpu() for x in (policy.normalization, policy.acting_network))
+        self.normalization: Normalization = copy.deepcopy(policy.normalization).cpu()
+        self.network: SequenceNetwork = copy.deepcopy(policy.acting_network).cpu()
         self.register_buffer("noise_table", policy.noise_table.cpu())
         self.context_length = policy.context_length
         self.keeps = policy.kv_cache and policy.context_length > 1
