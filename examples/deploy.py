@@ -86,7 +86,7 @@ def main() -> None:
             observation, reward, terminated, truncated, info = env.step(action)
             return_to_go, timestep, done = return_to_go - float(reward), timestep + 1, terminated or truncated
         success = f", success {info['is_success']}" if "is_success" in info else ""
-        took = f"{np.median(milliseconds):.2f} ms an action"
+        took = f"{np.mean(milliseconds):.2f} ms an action"
         print(f"episode {episode}: {timestep} steps, return {target - return_to_go:g}{success}; {took}")
 
 
