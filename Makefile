@@ -11,7 +11,7 @@ TOOLS := .venv-tools
 # Tests of each part that meets other packages.
 SMOKE := tests/cli/test_command_line.py tests/data/test_minari.py tests/envs/robosuite/test_env.py tests/files/test_model.py
 # What is checked and formatted besides the package.
-SOURCES := sb3_dtfm envs zoo_configs tests studies
+SOURCES := sb3_dtfm envs zoo_configs tests studies examples
 
 help:
 	@echo "make install  pinned environment in $(VENV), for Python 3.10 to 3.12"

@@ -24,7 +24,13 @@ OBSERVATION_DIM, ACTION_DIM, BATCH_SIZE, CONTEXT_LENGTH = 17, 6, 64, 20
 
 
 def make_model(
-    algo: str, width: int, n_layers: int, flow_hidden_dim: int, tokens_per_step: int, **policy_kwargs: object
+    algo: str,
+    width: int,
+    n_layers: int,
+    flow_hidden_dim: int,
+    tokens_per_step: int,
+    context_length: int = CONTEXT_LENGTH,
+    **policy_kwargs: object,
 ) -> OfflineSequenceAlgorithm:
     """DT or DTFM at its defaults but for the size and what is given."""
     rng = np.random.default_rng(0)
@@ -39,7 +45,7 @@ def make_model(
         "MultiInputPolicy",
         dataset=dataset,
         batch_size=BATCH_SIZE,
-        context_length=CONTEXT_LENGTH,
+        context_length=context_length,
         policy_kwargs={**sizes, **head, **policy_kwargs},
         device="cpu",
         seed=0,

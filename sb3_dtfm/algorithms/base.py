@@ -3,6 +3,8 @@
 import io
 from abc import ABC
 from collections.abc import Iterable
+from importlib.metadata import version
+from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -39,9 +41,10 @@ from sb3_dtfm.arguments import (
 from sb3_dtfm.data import Dataset, DatasetError, ScoreReference, TrajectoryBuffer, check_action_space, load_dataset
 from sb3_dtfm.distributed import check_batch_size, first_of_each_machine_first, is_first_process
 from sb3_dtfm.envs import check_vec_env, return_to_go_space
-from sb3_dtfm.files import ModelFile, ModelFileError, file_name, holds_pickles, read_model, write_model
+from sb3_dtfm.files import ModelFile, ModelFileError, file_name, holds_pickles, read_model, write_model, write_onnx
 from sb3_dtfm.optimization import LEARNING_RATE_SCHEDULES, PRECISIONS, RunningMeans
 from sb3_dtfm.policies import SequencePolicy
+from sb3_dtfm.policies.exported import ExportedPolicy
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineAlgorithm")
 
@@ -434,6 +437,33 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         tensors = {POLICY: parameters[POLICY], OPTIMIZER: optimizer_tensors(self.policy.optimizer)}
         write_model(path, ModelFile(to_configuration(self, left_out, wanted), tensors))
         self._last_saved = file_name(path)
+
+    def export(self, path: str | PathLike[str], env_id: str | None = None, target_return: float | None = None) -> None:
+        """
+        Write the policy into one ONNX file, as it acts at present: solver, steps, chunks, `kv_cache`.
+
+        Inputs and outputs are those of :class:`~sb3_dtfm.policies.exported.ExportedPolicy`; the file's metadata have JSON
+        under `sb3_dtfm`: sizes, bounds, settings of acting, and what is known of the task. On process 0 only, as `save`.
+
+        :param path: file to write, for example "policy.onnx"
+        :param env_id: Gymnasium id for the metadata; by default the environment's, or the dataset's
+        :param target_return: for the metadata, environment reward units; by default the environment's
+        :raises ImportError: `sb3-dtfm[export]` is not installed
+        :raises OSError: names the path, where what was there before still is
+        :raises ValueError: the head does what no graph holds
+        """
+        if not is_first_process():
+            return
+        if self.env is not None:
+            spec, asked = (self.env.get_attr(name, indices=0)[0] for name in ("spec", "target_return"))
+            env_id = env_id or (spec.id if spec is not None else None)
+            target_return = asked if target_return is None else target_return
+        if env_id is None and self.buffer is not None:
+            env_id = self.buffer.env_id
+        exported = ExportedPolicy(self.policy)
+        about = {"algorithm": type(self).__name__, "version": version("sb3-dtfm")}
+        settings = {**about, "env_id": env_id, "target_return": target_return, **exported.settings}
+        write_onnx(path, exported, exported.example(), exported.outputs, settings)
 
     def _excluded_save_params(self) -> list[str]:
         of_an_environment = [

@@ -20,10 +20,11 @@ COMMANDS = {
     "demo": "Record, train and evaluate on robosuite's Lift, start to end.",
     "plot": "Draw the learning curve of a run of `train`.",
     "sweep": "Ask trained models for one return after the other, and see what they reach.",
+    "export": "Write a trained policy into one ONNX file.",
     "benchmark": "Compare DT and DTFM on a grid of tasks, shares of the data and seeds.",
     "report": "Make tables and figures from the results of `benchmark`.",
 }
-WITHOUT_RL_ZOO = {"record"}
+WITHOUT_RL_ZOO = {"export", "record"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

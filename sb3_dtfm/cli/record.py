@@ -1,9 +1,9 @@
 """`sb3-dtfm record`: a dataset from a trained agent or a scripted demonstrator."""
 
 import argparse
-import ast
 from collections.abc import Sequence
-from typing import Any
+
+from sb3_dtfm.cli.literals import key_value
 
 EPILOG = """\
 An agent's files are pickles, and so are VecNormalize's statistics; an RL-Zoo run's YAML files can run code, too. Name those
@@ -16,15 +16,6 @@ examples:
 """
 
 
-def _keyword(text: str) -> tuple[str, Any]:
-    """An argument as RL-Zoo spells it, `key:value`, with a literal of Python as value."""
-    key, _, value = text.partition(":")
-    try:
-        return key, ast.literal_eval(value)
-    except (SyntaxError, ValueError):
-        raise argparse.ArgumentTypeError(f"{text!r} is no key:value with a number, 'text', list, ... of Python") from None
-
-
 # Options of each way to record: name, whether it must be given, and what argparse gets.
 AGENT_OPTIONS: dict[str, tuple[bool, dict]] = {
     "algo": (True, {"help": "algorithm of the agent, e.g. sac, tqc, ppo"}),
@@ -32,7 +23,7 @@ AGENT_OPTIONS: dict[str, tuple[bool, dict]] = {
     "env": (True, {"metavar": "ENV", "help": "Gymnasium environment id"}),
     "dataset_id": (True, {"metavar": "ID", "help": "Minari id to write, e.g. local/halfcheetah/expert-v0"}),
     "vec_normalize": (False, {"metavar": "FILE", "help": "the agent's VecNormalize statistics; 'none' insists on none"}),
-    "env_kwargs": (False, {"nargs": "+", "type": _keyword, "metavar": "KEY:VALUE", "help": "of the environment"}),
+    "env_kwargs": (False, {"nargs": "+", "type": key_value, "metavar": "KEY:VALUE", "help": "of the environment"}),
     "stochastic": (False, {"action": "store_true", "help": "draw actions instead of taking the best"}),
     "n_envs": (False, {"type": int, "metavar": "N", "help": "environments side by side"}),
 }

@@ -1,4 +1,4 @@
-"""Files: how one is replaced, and what a saved model is made of."""
+"""Files: how one is replaced, what a saved model is made of, and an exported one."""
 
 from sb3_dtfm.files.model import (
     ModelFile,
@@ -9,6 +9,7 @@ from sb3_dtfm.files.model import (
     read_model,
     write_model,
 )
+from sb3_dtfm.files.onnx import write_onnx
 from sb3_dtfm.files.replacing import find_leftovers, hidden_name, replacing
 
 __all__ = [
@@ -22,4 +23,5 @@ __all__ = [
     "read_model",
     "replacing",
     "write_model",
+    "write_onnx",
 ]

@@ -49,7 +49,8 @@ class Linear(nn.Linear):
         """From (..., in_features) to (..., out_features)."""
         n_rows = x.numel() // self.in_features
         if (
-            not 0 < n_rows <= FEW_ROWS
+            th.compiler.is_compiling()  # a graph is for any number of rows
+            or not 0 < n_rows <= FEW_ROWS
             or self.weight.numel() < LARGE_WEIGHT
             or x.device.type != "cpu"
             or x.dtype != th.float32

@@ -42,19 +42,18 @@ class TransformerBlock(nn.Module):
             key, value = F.linear(normed, weight[width:], bias[width:]).split(width, dim=-1)
         return self._finish(tokens[:, queries], query, key, value, attention_bias[:, :, queries])
 
-    def extend(self, tokens: th.Tensor, keys_values: th.Tensor, attention_bias: th.Tensor) -> th.Tensor:
+    def extend(self, tokens: th.Tensor, keys_values: th.Tensor, attention_bias: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         Compute new tokens only, from the keys and values of all.
 
         :param tokens: (B, N, D), the new ones
-        :param keys_values: (B, 2, L, D); those of the last N tokens are filled in here
+        :param keys_values: (B, 2, L, D); those of the last N tokens are filled in, see :func:`fill_in`
         :param attention_bias: (B, heads, N, L)
-        :return: (B, N, D)
+        :return: (B, N, D), and the keys and values (B, 2, L, D)
         """
         query, key, value = self.attention_in(self.attention_norm(tokens)).split(tokens.shape[-1], dim=-1)
-        keys_values[:, 0, -tokens.shape[1] :] = key
-        keys_values[:, 1, -tokens.shape[1] :] = value
-        return self._finish(tokens, query, keys_values[:, 0], keys_values[:, 1], attention_bias)
+        keys_values = fill_in(keys_values, key, value)
+        return self._finish(tokens, query, keys_values[:, 0], keys_values[:, 1], attention_bias), keys_values
 
     def _finish(
         self, tokens: th.Tensor, query: th.Tensor, key: th.Tensor, value: th.Tensor, attention_bias: th.Tensor
@@ -66,6 +65,23 @@ class TransformerBlock(nn.Module):
         tokens = dropout_add(tokens, self.attention_out(attended), self.dropout, self.training)
         mapped = self.mlp_out(F.gelu(self.mlp_in(self.mlp_norm(tokens))))
         return dropout_add(tokens, mapped, self.dropout, self.training)
+
+
+def fill_in(keys_values: th.Tensor, key: th.Tensor, value: th.Tensor) -> th.Tensor:
+    """
+    Keys and values with those of the last N tokens: in place, but for a graph, which has no memory to write into.
+
+    :param keys_values: (B, 2, L, D)
+    :param key: (B, N, D)
+    :param value: (B, N, D)
+    :return: (B, 2, L, D)
+    """
+    n_new = key.shape[1]
+    if th.compiler.is_compiling():
+        return th.cat((keys_values[:, :, :-n_new], th.stack((key, value), dim=1)), dim=2)
+    keys_values[:, 0, -n_new:] = key
+    keys_values[:, 1, -n_new:] = value
+    return keys_values
 
 
 def attention(query: th.Tensor, key: th.Tensor, value: th.Tensor, bias: th.Tensor, dropout_p: float) -> th.Tensor:
@@ -192,7 +208,7 @@ class SequenceTrunk(nn.Module):
         timesteps: th.Tensor,
         mask: th.Tensor,
         keys_values: th.Tensor,
-    ) -> th.Tensor:
+    ) -> tuple[th.Tensor, list[th.Tensor]]:
         """
         The newest step's hidden state from what earlier steps left behind: one step's tokens instead of a whole window's.
 
@@ -203,18 +219,19 @@ class SequenceTrunk(nn.Module):
 
         :param observations: (B, K, O), and the others as for :meth:`forward`; the last two steps are read
         :param keys_values: (B, layers, 2, L, D) for the L tokens of K steps (:meth:`n_tokens`), any finite number where
-            `mask` is False; those of the last `tokens_per_step` tokens are filled in here
-        :return: (B, D) hidden state
+            `mask` is False; those of the last `tokens_per_step` tokens are filled in, see :func:`fill_in`
+        :return: (B, D) hidden state, and the keys and values of each layer, (B, 2, L, D)
         """
         newest = (x[:, -2:] for x in (observations, actions, returns_to_go, timesteps, mask))
         tokens = self._tokens(*newest)[:, -self.tokens_per_step :]
         attention_bias = self._attention_bias(mask, keys_values.shape[3])[:, :, -self.tokens_per_step :]
         films = self._films(returns_to_go[:, -2:])
-        for block, film, block_keys_values in zip(self.blocks, films, keys_values.unbind(dim=1), strict=True):
+        filled = list(keys_values.unbind(dim=1))
+        for i, (block, film) in enumerate(zip(self.blocks, films, strict=True)):
             assert isinstance(block, TransformerBlock)
             newest_film = None if film is None else film[:, -self.tokens_per_step :]
-            tokens = block.extend(scale_and_shift(tokens, newest_film), block_keys_values, attention_bias)
-        return self.final_norm(tokens[:, -1])
+            tokens, filled[i] = block.extend(scale_and_shift(tokens, newest_film), filled[i], attention_bias)
+        return self.final_norm(tokens[:, -1]), filled
 
     def n_tokens(self, context_length: int) -> int:
         """Tokens of a window of K steps; of three a step the last action's is left out, since nothing attends to it."""

@@ -112,3 +112,8 @@ class Normalization(nn.Module):
     def scale_action(self, action: Any) -> Any:
         """From the environment's range to [-1, 1], (..., A)."""
         return 2.0 * (action - self.action_low) / (self.action_high - self.action_low) - 1.0
+
+    def unscale_action(self, action: th.Tensor) -> th.Tensor:
+        """From [-1, 1] to the environment's range and no further, (..., A)."""
+        low, high = self.action_low, self.action_high
+        return (low + 0.5 * (action + 1.0) * (high - low)).clamp(low, high)

@@ -407,7 +407,7 @@ class SequencePolicy(BasePolicy):
             earlier.mask[:, :n_back] = False  # the newest steps went round to the left
             memory, end = take_up(kept, n_new, device)
             start, end = end - n_kept, end + n_new
-            hidden = trunk.extend(**earlier._asdict(), keys_values=memory[..., start:end, :])
+            hidden, _ = trunk.extend(**earlier._asdict(), keys_values=memory[..., start:end, :])
             kept = hand_out(memory, start + n_new, end)
         return hidden, kept
 

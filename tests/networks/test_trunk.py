@@ -146,7 +146,7 @@ def keep_extending(trunk, window, n_steps):
             for key, value in seen.items()
         }
         keys_values = th.nn.functional.pad(kept, (0, 0, 0, n_new))
-        hidden = trunk.extend(**padded, keys_values=keys_values)
+        hidden, _ = trunk.extend(**padded, keys_values=keys_values)
         kept = keys_values[:, :, :, n_new:]
         hidden_states.append(hidden)
     return th.stack(hidden_states, dim=1)

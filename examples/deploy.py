@@ -1,0 +1,94 @@
+"""
+Act with an exported policy: NumPy and ONNX Runtime alone.
+
+`python examples/deploy.py policy.onnx` plays episodes of the task that the file names, robosuite's Lift for example. The
+environment comes from this package; `Policy` needs nothing of it, and goes wherever ONNX Runtime does.
+"""
+
+import argparse
+import json
+import time
+import zlib
+
+import numpy as np
+import onnxruntime
+
+TYPES = {"tensor(float)": np.float32, "tensor(int64)": np.int64, "tensor(bool)": np.bool_}
+
+
+class Policy:
+    """
+    The policy of one environment, with the context of its last steps.
+
+    :param path: what `model.export` wrote
+    """
+
+    def __init__(self, path: str) -> None:
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        self.settings = json.loads(self.session.get_modelmeta().custom_metadata_map["sb3_dtfm"])
+        shapes = {each.name: ([1, *each.shape[1:]], TYPES[each.type]) for each in self.session.get_inputs()}
+        self.inputs = {name: np.zeros(shape, dtype) for name, (shape, dtype) in shapes.items()}
+        self.plan: list[np.ndarray] = []
+
+    def act(self, observation: np.ndarray, return_to_go: float, timestep: int) -> np.ndarray:
+        """
+        The next action, as `predict(deterministic=True)` chooses it; time step 0 begins an episode.
+
+        :param observation: (O,)
+        :param return_to_go: target return less the rewards so far
+        :param timestep: counted from the episode's start
+        :return: (A,) in the environment's range
+        """
+        if timestep == 0:
+            self.inputs["mask"][:], self.plan = False, []
+            if "episode_keys" in self.inputs:
+                self.inputs["episode_keys"][:] = zlib.crc32(observation.astype(np.float32) + 0.0)  # no negative zeros
+        newest = {"observations": observation, "returns_to_go": return_to_go, "timesteps": timestep, "mask": True}
+        for name, value in {**newest, "actions": 0.0}.items():
+            self.inputs[name] = np.roll(self.inputs[name], -1, axis=1)
+            self.inputs[name][:, -1] = value
+        if not self.plan or "keys_values" in self.inputs:  # what is kept grows with each step
+            chunk, *kept = self.session.run(None, self.inputs)
+            self.inputs.update(zip(["keys_values"], kept, strict=False))
+            self.plan = self.plan or list(chunk[0, : self.settings["n_action_steps"]])
+        self.inputs["actions"][:, -1] = action = self.plan.pop(0)
+        return action
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Play episodes with an exported policy.")
+    parser.add_argument("policy", help="what `sb3-dtfm export` wrote")
+    parser.add_argument("--env", help="Gymnasium id; what the file says by default")
+    parser.add_argument("--target-return", type=float, help="to ask for; what the file says by default")
+    parser.add_argument("--episodes", type=int, default=10, help="10 by default")
+    parser.add_argument("--seed", type=int, default=0, help="of the first initial state")
+    options = parser.parse_args()
+
+    import gymnasium
+
+    import sb3_dtfm.envs  # noqa: F401  (registers robosuite's tasks)
+
+    policy = Policy(options.policy)
+    env_id = options.env or policy.settings["env_id"]
+    target = policy.settings["target_return"] if options.target_return is None else options.target_return
+    if env_id is None or target is None:
+        parser.error("the file does not say for which task it is: give --env and --target-return")
+    env = gymnasium.make(env_id)
+    for episode in range(options.episodes):
+        observation, info = env.reset(seed=options.seed + episode)
+        return_to_go, timestep, done, milliseconds = target, 0, False, []
+        while not done:
+            start = time.perf_counter()
+            action = policy.act(observation, return_to_go, timestep)
+            milliseconds.append((time.perf_counter() - start) * 1e3)
+            observation, reward, terminated, truncated, info = env.step(action)
+            return_to_go, timestep, done = return_to_go - float(reward), timestep + 1, terminated or truncated
+        success = f", success {info['is_success']}" if "is_success" in info else ""
+        took = f"{np.mean(milliseconds):.2f} ms an action"
+        print(f"episode {episode}: {timestep} steps, return {target - return_to_go:g}{success}; {took}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,18 @@
+"""Arguments of the command line that are literals of Python."""
+
+import argparse
+import ast
+from typing import Any
+
+
+def key_value(text: str) -> tuple[str, Any]:
+    """
+    An argument as RL-Zoo spells it, `key:value`, with a literal of Python as value.
+
+    :raises argparse.ArgumentTypeError: it is none
+    """
+    key, _, value = text.partition(":")
+    try:
+        return key, ast.literal_eval(value)
+    except (SyntaxError, ValueError):
+        raise argparse.ArgumentTypeError(f"{text!r} is no key:value with a number, 'text', list, ... of Python") from None

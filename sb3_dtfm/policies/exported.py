@@ -1,0 +1,118 @@
+"""A policy as one function of tensors, which a graph can hold: what lies between a context and the actions in `predict`."""
+
+import copy
+from typing import Any
+
+import torch as th
+from torch import nn
+from torch.nn import functional as F
+
+from sb3_dtfm.policies.normalization import Normalization
+from sb3_dtfm.policies.sequence import SequenceNetwork, SequencePolicy
+from sb3_dtfm.windows import Windows
+
+
+class ExportedPolicy(nn.Module):
+    """
+    The policy as it acts at present: from windows to actions, both in the environment's units, for any number of rows.
+
+    Whoever calls it keeps the windows: shifts them by a step, puts in the newest one, and when the action is carried out
+    that, too. A row begins anew when its mask is cleared; what is behind the mask may be any finite number.
+
+    :param policy: stays as it is; what acts of it is copied to the CPU
+    """
+
+    noise_table: th.Tensor
+
+    def __init__(self, policy: SequencePolicy) -> None:
+        super().__init__()
+        self.normalization: Normalization = copy.deepcopy(policy.normalization).cpu()
+        self.network: SequenceNetwork = copy.deepcopy(policy.acting_network).cpu()
+        self.register_buffer("noise_table", policy.noise_table.cpu())
+        self.context_length = policy.context_length
+        self.keeps = policy.kv_cache and policy.context_length > 1
+        self.settings: dict[str, Any] = {
+            "context_length": policy.context_length,
+            "chunk_size": policy.chunk_size,
+            "observation_dim": policy.observation_dim,
+            "action_dim": policy.action_dim,
+            "action_low": policy.action_space.low.tolist(),
+            "action_high": policy.action_space.high.tolist(),
+            "tokens_per_step": self.network.trunk.tokens_per_step,
+            "noise_dim": self.network.head.noise_dim,
+            **policy.acting_settings(),
+        }
+        self.eval().requires_grad_(False)
+
+    def forward(
+        self,
+        observations: th.Tensor,
+        actions: th.Tensor,
+        returns_to_go: th.Tensor,
+        timesteps: th.Tensor,
+        mask: th.Tensor,
+        noise: th.Tensor | None = None,
+        episode_keys: th.Tensor | None = None,
+        keys_values: th.Tensor | None = None,
+    ) -> tuple[th.Tensor, ...]:
+        """
+        :param observations: (B, K, O), newest step last, as the environment gives them
+        :param actions: (B, K, A) that were carried out, in the environment's range; the last one is not read
+        :param returns_to_go: (B, K), environment reward units
+        :param timesteps: (B, K) int64, counted from the episode's start
+        :param mask: (B, K) bool, False on padded steps
+        :param noise: (B, N), standard normal; a row of zeros takes what `predict(deterministic=True)` takes. For a head
+            that starts from noise
+        :param episode_keys: (B,) int64, CRC-32 of the bytes of each episode's first observation, float32; with `noise`
+        :param keys_values: (B, layers, 2, L, D), what the last call returned or any finite numbers; for `kv_cache`
+        :return: chunk (B, H, A), the actions for this step and the next ones, in the action space; with `kv_cache` the
+            next `keys_values`
+        """
+        trunk, head = self.network.trunk, self.network.head
+        scaled = self.normalization.scale_action(actions)
+        windows = self.normalization(Windows(observations, scaled, returns_to_go, timesteps, mask))._asdict()
+        kept: tuple[th.Tensor, ...] = ()
+        if keys_values is None:
+            hidden = trunk(**windows, last_only=True).squeeze(1)
+        else:
+            n_new = trunk.tokens_per_step
+            hidden, filled = trunk.extend(**windows, keys_values=F.pad(keys_values, (0, 0, 0, n_new)))
+            kept = (th.stack(filled, dim=1)[..., n_new:, :],)
+        if noise is None or episode_keys is None:
+            noise = hidden[:, :0]
+        else:
+            rows = (timesteps[:, -1] + episode_keys) % len(self.noise_table)
+            noise = th.where(noise.any(dim=1, keepdim=True), noise, self.noise_table[rows])
+        chunk = head(hidden, noise).clamp(-1.0, 1.0).unflatten(1, (-1, self.settings["action_dim"]))
+        return self.normalization.unscale_action(chunk), *kept
+
+    def example(self, n_rows: int = 2) -> dict[str, th.Tensor]:
+        """
+        Inputs of :meth:`forward` by name, those that this policy takes: full windows of random numbers.
+
+        :param n_rows: B
+        """
+        shape, trunk, noise_dim = (n_rows, self.context_length), self.network.trunk, self.settings["noise_dim"]
+        generator = th.Generator().manual_seed(0)
+
+        def draw(*shape: int) -> th.Tensor:
+            return th.randn(shape, generator=generator)
+
+        inputs = {
+            "observations": self.normalization.observation_mean + draw(*shape, self.settings["observation_dim"]),
+            "actions": self.normalization.unscale_action(draw(*shape, self.settings["action_dim"])),
+            "returns_to_go": self.normalization.return_scale * draw(*shape),
+            "timesteps": th.arange(self.context_length).repeat(n_rows, 1),
+            "mask": th.ones(shape, dtype=th.bool),
+        }
+        if noise_dim:
+            inputs |= {"noise": draw(n_rows, noise_dim), "episode_keys": th.arange(n_rows)}
+        if self.keeps:
+            n_kept = trunk.n_tokens(self.context_length) - trunk.tokens_per_step
+            inputs["keys_values"] = draw(n_rows, trunk.n_layers, 2, n_kept, trunk.embed_dim)
+        return inputs
+
+    @property
+    def outputs(self) -> list[str]:
+        """Names of what :meth:`forward` returns."""
+        return ["chunk", "next_keys_values"] if self.keeps else ["chunk"]
