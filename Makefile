@@ -9,7 +9,8 @@ PEERS := .venv-peers
 # What looks at dependencies, apart from them.
 TOOLS := .venv-tools
 # Tests of each part that meets other packages.
-SMOKE := tests/cli/test_command_line.py tests/data/test_minari.py tests/envs/robosuite/test_env.py tests/files/test_model.py
+SMOKE := tests/cli/test_command_line.py tests/data/test_minari.py tests/envs/robosuite/test_env.py tests/files/test_model.py \
+	tests/files/test_onnx.py
 # What is checked and formatted besides the package.
 SOURCES := sb3_dtfm envs zoo_configs tests studies examples
 
