@@ -28,6 +28,8 @@ REWARDS = ("rewards", "reward", "rews")
 ENDS, LENGTHS = "episode_ends", "episode_lengths"
 TERMINATIONS = ("terminations", "terminals", "terminated", "terminal")
 TRUNCATIONS = ("truncations", "timeouts", "truncated")
+# Of what is no file.
+NUMBERS_EXPECTED = "arrays of numbers are expected"
 # What TrajectoryBuffer.save adds.
 LOW, HIGH, ENV_ID = "action_low", "action_high", "env_id"
 
@@ -220,7 +222,8 @@ class _InMemory(_Arrays):
 
     def _get(self, name: str, where: str) -> np.ndarray:
         found = self._arrays[name]
-        return as_vectors(found, where) if isinstance(found, Mapping) else np.asarray(found)
+        with naming(where, NUMBERS_EXPECTED):
+            return as_vectors(found, where) if isinstance(found, Mapping) else np.asarray(found)
 
 
 @contextlib.contextmanager

@@ -11,7 +11,16 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_dtfm.data.buffer import TrajectoryBuffer
-from sb3_dtfm.data.flat import ACTIONS, OBSERVATIONS, REWARDS, TERMINATIONS, TRUNCATIONS, bounded_space, clipped
+from sb3_dtfm.data.flat import (
+    ACTIONS,
+    NUMBERS_EXPECTED,
+    OBSERVATIONS,
+    REWARDS,
+    TERMINATIONS,
+    TRUNCATIONS,
+    bounded_space,
+    clipped,
+)
 from sb3_dtfm.data.observations import as_vectors, flatten_observations
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_space, naming
@@ -81,7 +90,7 @@ def _trajectory(episode: Any, number: int, source: str) -> Trajectory:
     where = f"{source}, {name}"
     if isinstance(episode, Trajectory):
         return episode
-    with naming(where):
+    with naming(where, NUMBERS_EXPECTED):
         if isinstance(episode, Mapping):
             return _of_arrays(episode, name, where)
         if hasattr(episode, "obs") and hasattr(episode, "acts"):

@@ -144,14 +144,16 @@ def _read(folder: Path, names: Sequence[str], n_frames: int, source: str) -> tup
         raise DatasetError(f"{source}: there is no parquet file below {DATA}.")
     n_stored = sum(path.stat().st_size for path in paths)
     parts: list[dict[str, np.ndarray]] = []
-    n_found = 0
+    n_found = n_numbers = 0
     for path in paths:
         with naming(str(path)), pyarrow.parquet.ParquetFile(path) as file:
             missing = sorted(set(names) - set(file.schema_arrow.names))
             if missing:
                 raise DatasetError(f"{path}: has no column {', '.join(missing)}.")
             n_found += file.metadata.num_rows
-            check_size(8 * n_found * len(names), n_stored, f"{source}: {n_found} frames")
+            groups = [file.metadata.row_group(i) for i in range(file.metadata.num_row_groups)]
+            n_numbers += sum(group.column(i).num_values for group in groups for i in range(group.num_columns))
+            check_size(8 * n_numbers, n_stored, f"{source}: {n_found} frames")
             table = file.read(columns=list(names))
             table.validate(full=True)
             parts.append({name: _numbers(table[name].combine_chunks(), f"{path}: {name}") for name in names})

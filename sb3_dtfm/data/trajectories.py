@@ -24,11 +24,12 @@ class DatasetError(ValueError):
 
 
 @contextlib.contextmanager
-def naming(where: str) -> Iterator[None]:
+def naming(where: str, why: str = "the file is damaged or incomplete, or cut off") -> Iterator[None]:
     """
     Whatever the libraries that read a file raise over it becomes our own error, which says where.
 
     :param where: the file, and the episode or field that is read
+    :param why: what is the matter then
     :raises DatasetError: instead of any other exception
     """
     try:
@@ -37,7 +38,7 @@ def naming(where: str) -> Iterator[None]:
         raise
     except Exception as error:  # over damaged files they raise nearly everything
         what = f"{type(error).__name__}: {error}"
-        raise DatasetError(f"{where}: cannot be read ({what}); the file is damaged or incomplete, or cut off.") from error
+        raise DatasetError(f"{where}: cannot be read ({what}); {why}.") from error
 
 
 def check_real(dtype: Any, where: str) -> None:

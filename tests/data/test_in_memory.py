@@ -98,7 +98,6 @@ UNFIT = {
         [[(OBS[0], ACTS[0], 0.0)]],
         "episode 0 is a list; accepted are .*observation, action, reward, terminated",
     ),
-    "a path": (["episode.npz"], "episode 0 is a str"),
     "no actions": ([{"obs": OBS}], "episode 0: has no array one of actions, action, acts, only obs"),
     "other actions": (
         [{"obs": OBS, "acts": ACTS}, {"obs": OBS, "acts": ACTS[:, :1]}],
@@ -113,7 +112,10 @@ UNFIT = {
         [{"obs": OBS, "acts": ACTS, "rews": REWS[:2]}],
         r"rewards have shape \(2,\), expected \(3,\)",
     ),
-    "ragged": ([{"obs": [[1.0], [1.0, 2.0]], "acts": ACTS}], "episode 0: cannot be read .*inhomogeneous"),
+    "ragged": (
+        [{"obs": [[1.0], [1.0, 2.0]], "acts": ACTS}],
+        "episode 0: cannot be read .*inhomogeneous.*; arrays of numbers are expected",
+    ),
     "NaN": ([{"obs": OBS, "acts": ACTS, "rews": REWS * np.nan}], "episode 0, step 0: rewards hold nan"),
     "outside": (
         [{"obs": OBS, "acts": 3 * ACTS}],

@@ -114,6 +114,11 @@ def test_damaged_files(tmp_path):
     pq.write_table(table.append_column("action", [[[1.0]] * 11 + [[1.0, 2.0]]]), file)
     with pytest.raises(DatasetError, match=r"action holds lists of 1 to 2 numbers; one length is expected"):
         load_dataset(path)
+    zeros = pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(12 * 400_000, np.float32)), 400_000)
+    bomb = table.append_column("action", zeros)
+    pq.write_table(bomb, file)
+    with pytest.raises(DatasetError, match=r"arm: 12 frames claim 38\d{6} bytes, of which \d+ are stored"):
+        load_dataset(path)
     file.write_bytes(content[:-100])
     with pytest.raises(DatasetError, match=r"file-000.parquet: cannot be read"):
         load_dataset(path)
