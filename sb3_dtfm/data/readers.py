@@ -125,7 +125,7 @@ def load_dataset(
     accepted = [*own, *(["cache_dir"] if reader.fingerprint else []), *COMMON_OPTIONS]
     unknown = sorted(set(given) - set(accepted))
     if unknown:
-        name = str(dataset) if reader.fingerprint else reader.kind
+        name = reader.kind if is_mapping(dataset) or is_episodes(dataset) else str(dataset)
         raise TypeError(f"dataset {name}: unknown option {', '.join(unknown)}; accepted: {', '.join(accepted)}.")
     if "action_space" in inspect.signature(reader.load).parameters:
         kwargs["action_space"] = action_space
