@@ -1,8 +1,9 @@
 """Arguments that a user gives, checked by name: one way to say what is accepted, one message for what is not."""
 
+import difflib
 import math
 import numbers
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -83,3 +84,16 @@ def check_arguments(given: Mapping[str, Any], accepted: Mapping[str, Rule]) -> d
         if not rule.accepts(values[name]):
             raise ValueError(f"{name} must be {rule}, got {given[name]!r}.")
     return values
+
+
+def with_nearest(names: Iterable[str], known: Iterable[str]) -> str:
+    """
+    Names that nobody knows, for a message, each with the known one that may be meant.
+
+    :param names: as the user spelled them
+    :param known: all that are accepted
+    :return: for example "bach_size (did you mean batch_size?)"
+    """
+    known = list(known)
+    nearest = {name: difflib.get_close_matches(name, known, n=1) for name in names}
+    return ", ".join(name + (f" (did you mean {found[0]}?)" if found else "") for name, found in nearest.items())

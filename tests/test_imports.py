@@ -16,7 +16,7 @@ ROOMS = {
     "files": ("sb3_dtfm/files", {"files"}),
     "heads": ("sb3_dtfm/heads", {"heads", "networks", "arguments"}),
     "envs": ("envs", {"envs"}),
-    "data": ("sb3_dtfm/data", {"data", "envs", "files", "windows"}),
+    "data": ("sb3_dtfm/data", {"arguments", "data", "envs", "files", "windows"}),
     "recording": ("sb3_dtfm/recording", {"recording", "algorithms", "envs", "data", "files"}),
     "policies": ("sb3_dtfm/policies", {"networks", "heads", "windows", "arguments", "policies"}),
     "callbacks": ("sb3_dtfm/callbacks.py", {"data"}),
@@ -38,7 +38,7 @@ ROOMS = {
             "files",
         },
     ),
-    "zoo": ("sb3_dtfm/zoo", {"", "algorithms", "policies", "callbacks", "envs", "distributed", "files", "zoo"}),
+    "zoo": ("sb3_dtfm/zoo", {"", "algorithms", "arguments", "policies", "callbacks", "envs", "distributed", "files", "zoo"}),
     "benchmark": ("sb3_dtfm/benchmark", {"", "algorithms", "data", "envs", "zoo", "benchmark", "files"}),
     "cli": ("sb3_dtfm/cli", {"", "algorithms", "data", "envs", "recording", "zoo", "benchmark", "files", "cli"}),
 }

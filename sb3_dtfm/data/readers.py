@@ -12,6 +12,7 @@ from gymnasium import spaces
 from minari import MinariDataset
 from stable_baselines3.common.buffers import ReplayBuffer
 
+from sb3_dtfm.arguments import with_nearest
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, load_cached
 from sb3_dtfm.data.flat import fingerprint_flat_file, is_flat_file, is_mapping, load_flat
@@ -126,7 +127,9 @@ def load_dataset(
     unknown = sorted(set(given) - set(accepted))
     if unknown:
         name = reader.kind if is_mapping(dataset) or is_episodes(dataset) else str(dataset)
-        raise TypeError(f"dataset {name}: unknown option {', '.join(unknown)}; accepted: {', '.join(accepted)}.")
+        raise TypeError(
+            f"dataset {name}: unknown option {with_nearest(unknown, accepted)}; accepted: {', '.join(accepted)}."
+        )
     if "action_space" in inspect.signature(reader.load).parameters:
         kwargs["action_space"] = action_space
     if cache_dir is None or reader.fingerprint is None:

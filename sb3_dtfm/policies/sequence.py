@@ -13,7 +13,17 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, PROBABILITY_BELOW_1, Choice, Number, Rule, check_arguments
+from sb3_dtfm.arguments import (
+    BOOLEAN,
+    COUNT,
+    NOT_NEGATIVE,
+    PROBABILITY_BELOW_1,
+    Choice,
+    Number,
+    Rule,
+    check_arguments,
+    with_nearest,
+)
 from sb3_dtfm.heads import ActionHead
 from sb3_dtfm.networks.cpu import hand_out, take_up
 from sb3_dtfm.networks.trunk import SequenceTrunk
@@ -160,8 +170,9 @@ class SequencePolicy(BasePolicy):
     def _check_names(cls, head_options: dict[str, Any]) -> None:
         unknown = sorted(set(head_options) - set(cls.head_class.options()))
         if unknown:
-            accepted = ", ".join(sorted(cls.parameter_names()))
-            raise ValueError(f"policy_kwargs: {', '.join(unknown)} is unknown to {cls.__name__}; accepted are {accepted}.")
+            accepted = sorted(cls.parameter_names())
+            named = with_nearest(unknown, accepted)
+            raise ValueError(f"policy_kwargs: {named} is unknown to {cls.__name__}; accepted are {', '.join(accepted)}.")
 
     @property
     def acting_network(self) -> SequenceNetwork:
@@ -462,7 +473,8 @@ class SequencePolicy(BasePolicy):
         """
         unknown = sorted(set(settings) - set(self.acting_settings()))
         if unknown:
-            raise ValueError(f"{', '.join(unknown)}: no way of acting; accepted are {', '.join(self.acting_settings())}.")
+            accepted = self.acting_settings()
+            raise ValueError(f"{with_nearest(unknown, accepted)}: no way of acting; accepted are {', '.join(accepted)}.")
         settings = {**self.acting_settings(), **settings}
         own = check_arguments(settings, self._acting_rules())
         heads = self.network.head.check_acting(**{name: settings[name] for name in self.head_class.acting_choices})

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import inspect
 import os
 import shutil
 import signal
@@ -11,13 +12,19 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback
 
 from sb3_dtfm.algorithms import ALGORITHMS
+from sb3_dtfm.arguments import with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.distributed import is_first_process
+from sb3_dtfm.zoo.arguments import UsageError
 from sb3_dtfm.zoo.resuming import CHECKPOINT, KeepCheckpoint, ReplaceEvaluations, Start, StopSignals, go_on
+
+# Keys of its YAML files that no algorithm sees.
+OF_RL_ZOO = ("n_timesteps", "n_envs", "normalize", "frame_stack", "callback", "env_wrapper", "vec_env_wrapper", "env_kwargs")
 
 
 class TrainingError(RuntimeError):
@@ -55,11 +62,23 @@ class OfflineExperimentManager(ExperimentManager):
         """RL-Zoo's, which makes the run's folder before its model."""
         try:
             return super().setup_experiment()
-        except BaseException:
+        except BaseException as error:
             with contextlib.suppress(OSError):  # not made yet, or no longer empty: then it is a run's
                 os.rmdir(self.params_path)
                 shutil.rmtree(self.save_path)
+            if isinstance(error, TypeError):
+                self._check_names(error)
             raise
+
+    def _check_names(self, error: TypeError) -> None:
+        """
+        :param error: what the algorithm's constructor raised
+        :raises UsageError: because of a hyperparameter that it does not have
+        """
+        known = [*inspect.signature(ALGOS[self.algo]).parameters, *OF_RL_ZOO]
+        unknown = sorted(set(self._hyperparams) - set(known))
+        if unknown:
+            raise UsageError(f"{with_nearest(unknown, known)}: no hyperparameter of {self.algo}.") from error
 
     def create_callbacks(self) -> None:
         """RL-Zoo's, and the evaluations that a count of full intervals leaves out."""

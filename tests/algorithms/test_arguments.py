@@ -136,6 +136,7 @@ def test_an_unknown_argument_of_the_policy_is_refused_with_those_accepted(algori
     """What only DTFM knows is unknown to DT."""
     with pytest.raises(ValueError, match=rf"policy_kwargs.*\b{name}\b") as refusal:
         make_model(algorithm, cheetah_buffer, policy_kwargs={name: 64})
+    assert ("embed_dims (did you mean embed_dim?) is unknown" in str(refusal.value)) == (name == "embed_dims")
     own = {
         "embed_dim",
         "n_layers",

@@ -128,7 +128,15 @@ def test_hyperparameters_can_be_searched(workplace, capsys):
             tiny_training("dt", "--dataset", DATASET_ID, "--env", "Walker2d-v5"),
             "was recorded in HalfCheetah-v5, and the environment is Walker2d-v5",
         ),
-        (tiny_training("dt", "foo:1", "--dataset", DATASET_ID), "got an unexpected keyword argument 'foo'"),
+        (tiny_training("dt", "foo:1", "--dataset", DATASET_ID), "error: foo: no hyperparameter of dt."),
+        (
+            tiny_training("dt", "bach_size:8", "n_timestep:3", "--dataset", DATASET_ID),
+            "error: bach_size (did you mean batch_size?), n_timestep (did you mean n_timesteps?): no hyperparameter of dt.",
+        ),
+        (
+            ["train", "--algo", "sac", "--env", "Pendulum-v1", "-n", "20", "-params", "learning_start:5"],
+            "error: learning_start (did you mean learning_starts?): no hyperparameter of sac.",
+        ),
         (tiny_training("dt", "gamma", "--dataset", DATASET_ID), "-params gamma: expected key:value with a value in Python"),
         (tiny_training("dt", "env_wrapper:None", "--dataset", DATASET_ID), "ReturnToGoWrapper"),
         (

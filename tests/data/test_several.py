@@ -76,5 +76,5 @@ def test_only_data_of_one_task_are_joined():
     for weight in (0, -1.0, "much", np.inf):
         with pytest.raises(DatasetError, match=r"weight is .*; a positive number is accepted"):
             load_dataset([{"dataset": load_dataset(arrays(0.0)), "weight": weight}])
-    with pytest.raises(TypeError, match="unknown option shade"):
-        load_dataset([{"dataset": arrays(0.0), "shade": 1}])
+    with pytest.raises(TypeError, match=r"unknown option best_shade \(did you mean best_share\?\); accepted"):
+        load_dataset([{"dataset": arrays(0.0), "best_shade": 1}])
