@@ -23,6 +23,7 @@ DAMAGED = 1  # the episode that is changed
 N_STEPS, N_OBSERVATIONS, N_ACTIONS = sum(LENGTHS), 3, 2
 MINARI_ID = "corpus/set-v0"
 DATA_FOLDER = Path("datasets") / MINARI_ID / "data"
+LEROBOT_INFO, LEROBOT_DATA = Path("meta/info.json"), Path("data/chunk-000/file-000.parquet")
 # What should come of a dataset whose numbers are the good one's, and of one that is read though its numbers are others.
 SAME, READ = "same", "read"
 SPARSE = 10**12  # rows
@@ -91,6 +92,26 @@ def write_good(folder: Path, monkeypatch: Any) -> None:
         file["mask/train"] = np.array([b"demo_0", b"demo_1", b"demo_2"])
     (folder / "npz").mkdir()
     np.savez(folder / "npz" / "set.npz", **flat_arrays())
+    (folder / "flat").mkdir()
+    with h5py.File(folder / "flat" / "set.hdf5", "w") as file:
+        for name, array in flat_arrays().items():
+            file[name] = array
+    write_lerobot(folder / "lerobot" / "arm")
+
+
+def write_lerobot(folder: Path) -> None:
+    arrays = flat_arrays()
+    features = {
+        "observation.state": arrays["observations"], "action": arrays["actions"], "next.reward": arrays["rewards"],
+        "frame_index": np.concatenate([np.arange(n) for n in LENGTHS]),
+        "episode_index": np.repeat(np.arange(len(LENGTHS)), LENGTHS),
+    }  # fmt: skip
+    told = {name: {"dtype": str(array.dtype), "shape": array.shape[1:] or [1]} for name, array in features.items()}
+    for file in (LEROBOT_INFO, LEROBOT_DATA):
+        (folder / file).parent.mkdir(parents=True)
+    counts = {"total_frames": N_STEPS, "total_episodes": len(LENGTHS)}
+    (folder / LEROBOT_INFO).write_text(json.dumps({"codebase_version": "v3.0", **counts, "features": told}))
+    pyarrow.parquet.write_table(pa.table({name: list(array) for name, array in features.items()}), folder / LEROBOT_DATA)
 
 
 def flat_arrays() -> dict[str, np.ndarray]:

@@ -18,6 +18,9 @@ from tests.data import corpus
 
 FILES = {
     "npz": "set.npz",
+    "flat": "set.hdf5",
+    "lerobot": "arm" / corpus.LEROBOT_DATA,
+    "lerobot, told": "arm" / corpus.LEROBOT_INFO,
     "robomimic": "set.hdf5",
     "hdf5": corpus.DATA_FOLDER / "main_data.hdf5",
     "metadata": corpus.DATA_FOLDER / "metadata.json",
@@ -55,13 +58,16 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         corpus.write_good(folder, patch)
     shutil.copytree(folder / "hdf5", folder / "metadata")
+    shutil.copytree(folder / "lerobot", folder / "lerobot, told")
     return folder
 
 
 def read_or_refuse(folder: Path, kind: str) -> None:
     """What is read is whole: as many steps as the episodes have, all of them finite."""
     options = {"observation_keys": ["state"]} if kind == "robomimic" else {}
-    dataset = folder / FILES[kind] if kind in ("npz", "robomimic") else corpus.MINARI_ID
+    paths = {"npz": FILES["npz"], "flat": FILES["flat"], "robomimic": FILES["robomimic"]}
+    paths |= dict.fromkeys(("lerobot", "lerobot, told"), "arm")
+    dataset = folder / paths[kind] if kind in paths else corpus.MINARI_ID
     signal.alarm(MOST_SECONDS)
     try:
         with warnings.catch_warnings():
