@@ -61,7 +61,7 @@ test: install
 	$(BIN)/python -m pytest -n 2 --durations=10
 
 test-all: install
-	$(BIN)/python -m pytest -n 2 --dist worksteal --durations=20 -m "slow or not slow"
+	$(BIN)/python -m pytest -n 2 --maxschedchunk 1 --durations=20 -m "slow or not slow"
 
 bench: install $(PEERS)/installed
 	$(BIN)/python studies/compare.py --peer-python $(PEERS)/bin/python
