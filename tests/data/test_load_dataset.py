@@ -168,7 +168,8 @@ def test_anything_else_is_refused_with_what_is_accepted(dataset: Any):
 
 def test_an_unknown_option_is_refused_with_those_there_are(robomimic_file: Path, minari_dataset: minari.MinariDataset):
     with pytest.raises(
-        TypeError, match="unknown option filter; accepted: filter_key, observation_keys, on_invalid, cache_dir"
+        TypeError,
+        match=r"unknown option filter \(did you mean filter_key\?\); accepted: filter_key, observation_keys, on_invalid",
     ):
         load_dataset(robomimic_file, filter="train")
     with pytest.raises(TypeError, match="test/ones-v0: unknown option filter_key; accepted: on_invalid, cache_dir, env_id"):
