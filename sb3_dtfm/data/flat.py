@@ -73,7 +73,7 @@ def json_options(options: dict[str, Any]) -> dict[str, Any]:
     """
     options = dict(options)
     space = options.pop("action_space", None)
-    if "action_bounds" not in options and space is not None:
+    if options.get("action_bounds") is None and space is not None:
         options["action_bounds"] = (space.low, space.high)
     if options.get("action_bounds") is not None:
         options["action_bounds"] = [np.asarray(bound).tolist() for bound in options["action_bounds"]]

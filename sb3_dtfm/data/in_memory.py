@@ -65,12 +65,7 @@ def load_episodes(
         actions out of bounds; names the episode and the step
     """
     source = "episodes"
-    if not len(episodes):
-        raise DatasetError(f"{source}: the list is empty; at least one episode is needed.")
-    shape = _trajectory(episodes[0], 0, source).actions.shape
-    if len(shape) != 2:
-        raise DatasetError(f"{source}, episode 0: actions have shape {shape}; (T, A) is expected.")
-    space = bounded_space(action_bounds, action_space, shape[1], source)
+    space = bounded_space(action_bounds, action_space, _n_actions(episodes, source, on_invalid), source)
 
     def trajectory(number: int) -> Trajectory:
         found = _trajectory(episodes[number], number, source)
@@ -82,6 +77,20 @@ def load_episodes(
     return TrajectoryBuffer.from_trajectories(
         map(trajectory, numbers), space, source=source, storage=storage, on_invalid=on_invalid
     )
+
+
+def _n_actions(episodes: Sequence[Any], source: str, on_invalid: str) -> int:
+    """A, of the first episode, or the first that can be kept."""
+    for number, episode in enumerate(episodes):
+        try:
+            shape = _trajectory(episode, number, source).actions.shape
+            if len(shape) != 2:
+                raise DatasetError(f"{source}, episode {number}: actions have shape {shape}; (T, A) is expected.")
+            return int(shape[1])
+        except DatasetError:
+            if on_invalid != "drop" or number == len(episodes) - 1:
+                raise
+    raise DatasetError(f"{source}: the list is empty; at least one episode is needed.")
 
 
 def _trajectory(episode: Any, number: int, source: str) -> Trajectory:
@@ -127,8 +136,11 @@ def _of_arrays(arrays: Mapping[str, Any], name: str, where: str) -> Trajectory:
         return arrays[found[0]]
 
     def flag(names: Sequence[str]) -> bool:
-        given = [arrays[key] for key in names if key in arrays]
-        return bool(np.asarray(given[0]).reshape(-1)[-1]) if given else False
+        given = [np.asarray(arrays[key]).reshape(-1) for key in names if key in arrays]
+        if given and given[0][:-1].any():
+            step = int(np.argmax(given[0]))
+            raise DatasetError(f"{where}: ends at step {step} of {len(given[0])}; arrays of several episodes need no list.")
+        return bool(given[0][-1]) if given else False
 
     actions = np.asarray(find(ACTIONS))
     n_steps = len(actions) if actions.ndim else 0

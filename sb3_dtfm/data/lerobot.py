@@ -178,7 +178,7 @@ def _numbers(values: Any, where: str) -> np.ndarray:
 
 def _recorded(actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Smallest and largest action of each dimension; 1 around one that never changes."""
-    with np.errstate(invalid="ignore"):
-        low, high = np.nanmin(actions, axis=0), np.nanmax(actions, axis=0)
+    finite = np.where(np.isfinite(actions), actions, 0.0)  # others are refused by their step
+    low, high = finite.min(axis=0), finite.max(axis=0)
     still = low == high
     return low - still, high + still

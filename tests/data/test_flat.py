@@ -122,6 +122,8 @@ def test_an_hdf5_file_in_d4rls_layout(tmp_path):
     np.testing.assert_array_equal(buffer.observations, found["observations"].astype(np.float32))
     cached = load_dataset(path, cache_dir=tmp_path / "cache", action_space=spaces.Box(-2, 2, (2,)))
     assert cached.action_space == spaces.Box(-2, 2, (2,))
+    wider = load_dataset(path, cache_dir=tmp_path / "cache", action_bounds=None, action_space=spaces.Box(-3, 3, (2,)))
+    assert wider.action_space == spaces.Box(-3, 3, (2,)), "a cache of its own"
     np.testing.assert_array_equal(cached.returns_to_go, buffer.returns_to_go)
     with h5py.File(path, "a") as file:
         del file["rewards"]

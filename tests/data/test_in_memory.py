@@ -112,6 +112,10 @@ UNFIT = {
         [{"obs": OBS, "acts": ACTS, "rews": REWS[:2]}],
         r"rewards have shape \(2,\), expected \(3,\)",
     ),
+    "several episodes": (
+        [{"obs": OBS, "acts": ACTS, "terminals": [False, True, False]}],
+        "episode 0: ends at step 1 of 3; arrays of several episodes need no list",
+    ),
     "ragged": (
         [{"obs": [[1.0], [1.0, 2.0]], "acts": ACTS}],
         "episode 0: cannot be read .*inhomogeneous.*; arrays of numbers are expected",
@@ -134,6 +138,10 @@ def test_an_unfit_episode_can_be_dropped_and_actions_clipped():
     good, bad = {"obs": OBS, "acts": ACTS}, {"obs": OBS * np.inf, "acts": ACTS}
     with pytest.warns(UserWarning, match="1 of 2 episodes have been dropped"):
         assert load_dataset([good, bad], on_invalid="drop").n_episodes == 1
+    with pytest.warns(UserWarning, match="2 of 3 episodes have been dropped"):
+        assert load_dataset([{"obs": OBS}, {"obs": OBS, "acts": ACTS[:, 0]}, good], on_invalid="drop").n_episodes == 1
+    with pytest.raises(DatasetError, match="episode 1: has no array one of actions"):
+        load_dataset([{"obs": OBS}] * 2, on_invalid="drop")
     assert load_dataset([{"obs": OBS, "acts": 9 * ACTS}], clip_actions=True).actions.abs().max() == 1.0
 
 

@@ -98,8 +98,9 @@ UNFIT = {
 @pytest.mark.parametrize(("changes", "message"), UNFIT.values(), ids=UNFIT)
 def test_what_does_not_fit_is_refused_by_name(changes, message, version, tmp_path):
     path = write(tmp_path / "arm", version, **changes)
-    with pytest.raises(DatasetError, match=f"arm.*{message}"):
-        load_dataset(path, action_bounds=(-90, 90))
+    for options in ({}, {"action_bounds": (-90, 90)}):
+        with pytest.raises(DatasetError, match=f"arm.*{message}"):
+            load_dataset(path, **options)
 
 
 def test_damaged_files(tmp_path):
