@@ -1,26 +1,21 @@
 """Environments: the return-to-go wrapper and the tasks that importing this package registers with Gymnasium."""
 
-import contextlib
-import io
+from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
+from sb3_dtfm.envs.robosuite.registration import register_robosuite_envs
+from sb3_dtfm.envs.robotics import register_gymnasium_robotics
 
-from sb3_dtfm.envs.return_to_go import (
-    OBSERVATION,
-    RETURN_TO_GO,
-    TIMESTEP,
-    ReturnToGoWrapper,
-    check_vec_env,
-    flatten_observation_space,
-    return_to_go_space,
-)
-from sb3_dtfm.envs.robosuite import register_robosuite_envs
+if TYPE_CHECKING:
+    from sb3_dtfm.envs.return_to_go import (
+        OBSERVATION,
+        RETURN_TO_GO,
+        TIMESTEP,
+        ReturnToGoWrapper,
+        check_vec_env,
+        flatten_observation_space,
+        return_to_go_space,
+    )
 
-# On import gymnasium-robotics prints notices about tasks that this project does not use, once in every worker process.
-with contextlib.redirect_stderr(io.StringIO()):
-    import gymnasium_robotics
-
-gym.register_envs(gymnasium_robotics)
 register_robosuite_envs()
 
 __all__ = [
@@ -30,6 +25,16 @@ __all__ = [
     "ReturnToGoWrapper",
     "check_vec_env",
     "flatten_observation_space",
+    "register_gymnasium_robotics",
     "register_robosuite_envs",
     "return_to_go_space",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """The wrapper and what comes with it, when they are asked for: Stable-Baselines3 takes seconds to import."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from sb3_dtfm.envs import return_to_go
+
+    return getattr(return_to_go, name)

@@ -1,12 +1,25 @@
 """Offline reinforcement learning for Stable-Baselines3: Decision Transformers with and without a flow-matching head."""
 
 import os
+from typing import TYPE_CHECKING, Any
 
 # Before torch starts its threads: by default they spin while they wait, and on a core that is shared with a simulator or
 # another job they take the time that the others need (docs/performance.md).
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-from sb3_dtfm.algorithms import DT, DTFM
+import sb3_dtfm.envs  # noqa: F401  (registers the tasks)
+
+if TYPE_CHECKING:
+    from sb3_dtfm.algorithms import DT, DTFM
 
 __all__ = ["DT", "DTFM"]
 __version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> Any:
+    """The algorithms, when they are asked for: PyTorch takes seconds to import."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from sb3_dtfm import algorithms
+
+    return getattr(algorithms, name)

@@ -22,11 +22,12 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.benchmark.evaluation import FINAL_STATES
-from sb3_dtfm.envs import ReturnToGoWrapper
+from sb3_dtfm.envs import ReturnToGoWrapper, register_gymnasium_robotics
 from sb3_dtfm.recording.agent import episode_seeds
 from sb3_dtfm.recording.episodes import EpisodeRecorder, run_episodes
 from sb3_dtfm.recording.minari import check_dataset_id, write_minari
 
+register_gymnasium_robotics()
 ENV_ID = "PointMaze_UMaze-v3"
 ENV_KWARGS = {
     "maze_map": [[1, 1, 1, 1, 1], [1, 0, "g", 0, 1], [1, 0, 1, 0, 1], [1, 0, "r", 0, 1], [1, 1, 1, 1, 1]],

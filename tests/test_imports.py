@@ -1,9 +1,14 @@
 """Who may import whom: read from the sources, so that no import has to happen."""
 
 import ast
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+
+from tests.data.corpus import write_lerobot
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = "sb3_dtfm"
@@ -98,3 +103,82 @@ def test_every_module_belongs_to_a_room():
         ROOT / "sb3_dtfm" / name for name in ("__init__.py", "__main__.py")
     }
     assert set((ROOT / "sb3_dtfm").rglob("*.py")) <= known
+
+
+# Of the extras, a module each. None in `sys.modules` is a package that is not there.
+EXTRAS = (
+    "gymnasium_robotics",
+    "huggingface_hub",
+    "mujoco",
+    "onnx",
+    "pyarrow",
+    "rl_zoo3",
+    "robosuite",
+    "sb3_contrib",
+    "scipy",
+)
+WITHOUT_EXTRAS = f"import sys; sys.modules.update(dict.fromkeys({EXTRAS}))\n"
+LEARN = """
+import gymnasium as gym
+import numpy as np
+from sb3_dtfm import DTFM
+from sb3_dtfm.envs import ReturnToGoWrapper
+
+episode = dict(observations=np.zeros((9, 3)), actions=np.zeros((9, 1)), rewards=np.ones(9))
+env = ReturnToGoWrapper(gym.make("Pendulum-v1"), target_return=0.0)
+small = dict(embed_dim=8, n_layers=1, n_heads=1, flow_hidden_dim=8)
+DTFM("MultiInputPolicy", env, [episode], batch_size=2, context_length=2, policy_kwargs=small).learn(2).save("model")
+model = DTFM.load("model", env)
+print("acts", model.predict(model.get_env().reset())[0].shape)
+"""
+
+
+def python(program: str, folder: Path) -> str:
+    environment = {**os.environ, "MINARI_DATASETS_PATH": str(folder / "minari")}
+    command = [sys.executable, "-c", program]
+    process = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stdout + process.stderr
+    return process.stdout
+
+
+def test_an_import_registers_tasks_and_leaves_pytorch_for_later(tmp_path):
+    heavy = '{"h5py", "minari", "mujoco", "stable_baselines3", "torch"} & set(sys.modules)'
+    program = (
+        f"import sys, gymnasium, sb3_dtfm; print('robosuite/Lift-v0' in gymnasium.registry, {heavy}, sb3_dtfm.DT.__name__)"
+    )
+    assert python(program, tmp_path) == "True set() DT\n"
+
+
+def test_help_and_version_come_within_a_second_of_the_processor(tmp_path):
+    call = "with contextlib.suppress(SystemExit):\n    main([option])\n"
+    measured = "assert time.process_time() < 1.0, time.process_time()"
+    for option, text in (("--help", "commands:"), ("--version", "sb3-dtfm ")):
+        program = f"import contextlib, time\nfrom sb3_dtfm.cli.main import main\noption = {option!r}\n{call}{measured}"
+        assert text in python(program, tmp_path)
+
+
+def test_a_model_learns_from_arrays_and_acts_without_any_extra(tmp_path):
+    assert "acts (1, 1)" in python(WITHOUT_EXTRAS + LEARN, tmp_path)
+
+
+MISSING = {
+    "train --algo dtfm": 'needs RL-Zoo: pip install "sb3-dtfm[zoo]"',
+    "record --demonstrator lift --episodes 1 --output lift.hdf5": 'pip install "sb3-dtfm[robosuite]"',
+    "record --algo tqc --model a.zip --env Pendulum-v1 --episodes 1 --dataset-id my/own-v0": 'pip install "sb3-dtfm[zoo]"',
+    "record --algo sac --model a.zip --env Ant-v5 --episodes 1 --dataset-id my/own-v0": 'pip install "gymnasium[mujoco]"',
+    "inspect no/such-v0": 'cannot be downloaded: for that, pip install "sb3-dtfm[minari]"',
+    "inspect arm": 'to read Parquet and Arrow files: pip install "sb3-dtfm[minari]"',
+}
+
+
+def test_an_extra_that_is_missing_is_named(tmp_path):
+    (tmp_path / "a.zip").touch()
+    write_lerobot(tmp_path / "arm")
+    program = f"""
+from sb3_dtfm.cli.main import main
+for line in {list(MISSING)}:
+    assert main(line.split()) == 2
+"""
+    messages = python(WITHOUT_EXTRAS + "sys.stderr = sys.stdout\n" + program, tmp_path).splitlines()
+    for line, expected, found in zip(MISSING, MISSING.values(), messages, strict=True):
+        assert expected in found, line

@@ -4,12 +4,13 @@ import argparse
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from sb3_dtfm.cli.literals import key_value
 from sb3_dtfm.data import TrajectoryBuffer, load_dataset
 from sb3_dtfm.data.inspection import Inspection, Range, inspect_buffer
-from sb3_dtfm.zoo.arguments import key_values
 
 BLUE, RED, GREY = "#1b6ca8", "#c0562b", "0.6"
 # Episodes whose rewards are drawn.
@@ -24,7 +25,7 @@ def main(argv: Sequence[str]) -> None:
     """
     options = _parser().parse_args(argv)
     dataset = options.dataset[0] if len(options.dataset) == 1 else options.dataset
-    buffer = load_dataset(dataset, **key_values("--dataset-kwargs", options.dataset_kwargs))
+    buffer = load_dataset(dataset, **dict(options.dataset_kwargs))
     found = inspect_buffer(buffer)
     print("\n".join(table(buffer, found)))
     for remark in found.remarks:
@@ -40,7 +41,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     argument = parser.add_argument
     argument("dataset", nargs="+", metavar="DATASET", help="Minari id, robomimic file or flat arrays; or several")
-    argument("--dataset-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="options of its reader, as for train")
+    argument(
+        "--dataset-kwargs",
+        nargs="+",
+        type=key_value,
+        default=[],
+        metavar="KEY:VALUE",
+        help="options of its reader, as for train",
+    )
     argument("-o", "--output", default="dataset.png", metavar="FILE", help="PNG to write; dataset.png by default")
     return parser
 
@@ -76,7 +84,9 @@ def _interval(low: np.ndarray, high: np.ndarray) -> str:
     return f"[{low.min():.4g}, {high.max():.4g}]"
 
 
-def command(datasets: Sequence[str], dataset_kwargs: Sequence[str], buffer: TrajectoryBuffer, found: Inspection) -> str:
+def command(
+    datasets: Sequence[str], dataset_kwargs: Sequence[tuple[str, Any]], buffer: TrajectoryBuffer, found: Inspection
+) -> str:
     """
     A training of this dataset.
 
@@ -88,7 +98,7 @@ def command(datasets: Sequence[str], dataset_kwargs: Sequence[str], buffer: Traj
     words = ["sb3-dtfm", "train", "--algo", "dtfm", "--env", buffer.env_id or "TASK", "--conf-file", "small"]
     words += ["--dataset", *datasets, "--target-return", f"{found.target_return:g}"]
     if dataset_kwargs:
-        inside = ", ".join("=".join(text.split(":", 1)) for text in dataset_kwargs)
+        inside = ", ".join(f"{key}={value!r}" for key, value in dataset_kwargs)
         words += ["-params", f"dataset_kwargs:dict({inside})"]
     return shlex.join(words)
 

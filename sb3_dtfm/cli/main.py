@@ -8,6 +8,8 @@ from collections.abc import Sequence
 
 from gymnasium.error import Error as GymnasiumError
 
+from sb3_dtfm import __version__
+
 # What a user's mistake is raised as: TypeError for an argument that somebody's constructor does not know.
 EXPECTED_ERRORS = (ValueError, TypeError, AssertionError, OSError, ImportError, GymnasiumError)
 
@@ -24,7 +26,7 @@ COMMANDS = {
     "benchmark": "Compare DT and DTFM on a grid of tasks, shares of the data and seeds.",
     "report": "Make tables and figures from the results of `benchmark`.",
 }
-WITHOUT_RL_ZOO = {"export", "record"}
+WITHOUT_RL_ZOO = {"export", "inspect", "record"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -56,6 +58,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog="\n".join(["commands:", *lines, "", "`sb3-dtfm COMMAND --help` lists a command's arguments."]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     parser.add_argument("--debug", action="store_true", help="show the traceback of any error")
     parser.add_argument("command", choices=COMMANDS, metavar="COMMAND", help=", ".join(COMMANDS))
     parser.add_argument("arguments", nargs=argparse.REMAINDER, metavar="...", help="the command's own arguments")

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet
 from gymnasium import spaces
 
+from sb3_dtfm.data.arrow import import_pyarrow
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint
 from sb3_dtfm.data.flat import bounded_space, clipped, json_options
@@ -142,6 +142,7 @@ def _read(folder: Path, names: Sequence[str], n_frames: int, source: str) -> tup
     paths = sorted((folder / DATA).rglob("*.parquet"))
     if not paths:
         raise DatasetError(f"{source}: there is no parquet file below {DATA}.")
+    pyarrow = import_pyarrow(source)
     n_stored = sum(path.stat().st_size for path in paths)
     parts: list[dict[str, np.ndarray]] = []
     n_found = n_numbers = 0
@@ -166,6 +167,7 @@ def _read(folder: Path, names: Sequence[str], n_frames: int, source: str) -> tup
 def _numbers(values: Any, where: str) -> np.ndarray:
     """A column as (N, .), whose entries are numbers or lists of as many."""
     n_rows = len(values)
+    pyarrow = import_pyarrow(where)
     if pyarrow.types.is_list(values.type) or pyarrow.types.is_fixed_size_list(values.type):
         sizes = np.unique(np.diff(values.offsets.to_numpy())) if pyarrow.types.is_list(values.type) else np.zeros(1)
         if len(sizes) > 1:

@@ -12,12 +12,12 @@ from typing import Any
 import h5py
 import minari
 import numpy as np
-import pyarrow.dataset
 from gymnasium import spaces
 from minari.dataset.minari_dataset import parse_dataset_id
 from minari.serialization import deserialize_space
 from minari.storage import get_dataset_path
 
+from sb3_dtfm.data.arrow import import_pyarrow
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint
 from sb3_dtfm.data.hdf5 import open_group, read_hdf5
@@ -151,9 +151,10 @@ def _download(dataset_id: str) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             local = sorted(minari.list_local_datasets())
+        why = 'for that, pip install "sb3-dtfm[minari]"' if isinstance(error, ImportError) else error
         raise DatasetError(
             f"Minari dataset {dataset_id} is not in {get_dataset_path()} (set by MINARI_DATASETS_PATH), which holds "
-            f"{', '.join(local) if local else 'no dataset'}; and it cannot be downloaded: {error}"
+            f"{', '.join(local) if local else 'no dataset'}; and it cannot be downloaded: {why}"
         ) from error
 
 
@@ -259,6 +260,7 @@ def _hdf5_reader(stack: contextlib.ExitStack, folder: Path, source: str) -> Call
 
 def _arrow_reader(data_format: str, folder: Path, source: str) -> Callable[[int], ReadArray]:
     """Reads the Arrow or Parquet files of an episode itself, since Minari's storage takes each for a single batch."""
+    pyarrow = import_pyarrow(source)
 
     def episode(index: int) -> ReadArray:
         files = pyarrow.dataset.dataset(

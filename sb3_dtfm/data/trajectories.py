@@ -30,11 +30,11 @@ def naming(where: str, why: str = "the file is damaged or incomplete, or cut off
 
     :param where: the file, and the episode or field that is read
     :param why: what is the matter then
-    :raises DatasetError: instead of any other exception
+    :raises DatasetError: instead of any other exception, but of a package that is missing
     """
     try:
         yield
-    except DatasetError:
+    except (DatasetError, ImportError):
         raise
     except Exception as error:  # over damaged files they raise nearly everything
         what = f"{type(error).__name__}: {error}"

@@ -16,8 +16,8 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 from tqdm import tqdm
 
-import sb3_dtfm.envs  # noqa: F401  (registers the tasks)
 from sb3_dtfm.data.trajectories import check_action_space
+from sb3_dtfm.envs import register_gymnasium_robotics
 from sb3_dtfm.recording.episodes import (
     ActFunction,
     EpisodeRecorder,
@@ -88,6 +88,7 @@ def record_agent(
     if n_envs < 1:
         raise ValueError(f"n_envs must be at least 1, got {n_envs}.")
     check_dataset_id(dataset_id, overwrite)
+    register_gymnasium_robotics()
     files = find_agent(model_path, env_id)
     make_kwargs = {**files.env_kwargs, **(env_kwargs or {})}
     recorders = [EpisodeRecorder(gym.make(env_id, **make_kwargs)) for _ in range(min(n_envs, n_episodes))]

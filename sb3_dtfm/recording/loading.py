@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import importlib
+import importlib.util
 import inspect
 import json
 import warnings
@@ -124,7 +125,9 @@ def load_agent(algo: str, model: str | Path, device: str) -> BaseAlgorithm:
     :raises ValueError: unknown algorithm, no agent, or one of another algorithm
     """
     if algo.lower() not in known_algorithms():
-        raise ValueError(f"Unknown algorithm {algo!r}; known are {', '.join(sorted(known_algorithms()))}.")
+        known = ", ".join(sorted(known_algorithms()))
+        more = "" if importlib.util.find_spec("sb3_contrib") else '; sb3-contrib\'s (tqc, ...): pip install "sb3-dtfm[zoo]"'
+        raise ValueError(f"Unknown algorithm {algo!r}; known are {known}{more}.")
     algorithm = known_algorithms()[algo.lower()]
     _check_algorithm(algorithm, Path(model))
     leave_out = {"learning_rate": 0.0, "lr_schedule": lambda _: 0.0, "clip_range": lambda _: 0.0}

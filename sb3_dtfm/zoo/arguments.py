@@ -11,6 +11,7 @@ import yaml
 from rl_zoo3.utils import StoreDict
 
 from sb3_dtfm.algorithms import ALGORITHMS
+from sb3_dtfm.envs import register_gymnasium_robotics
 from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, packaged_config
 
 TRAIN_EXAMPLES = """\
@@ -44,11 +45,12 @@ def key_values(option: str, texts: Sequence[str]) -> dict[str, Any]:
 
 def import_packages(modules: Sequence[str]) -> None:
     """
-    Import what registers tasks, as RL-Zoo's `--gym-packages` does.
+    Import what registers tasks, as RL-Zoo's `--gym-packages` does; gymnasium-robotics needs no mention.
 
     :param modules: dotted names
     :raises UsageError: there is none of that name
     """
+    register_gymnasium_robotics()
     for module in modules:
         try:
             importlib.import_module(module)

@@ -10,6 +10,7 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
 
 from sb3_dtfm.algorithms import ALGORITHMS
+from sb3_dtfm.envs import register_gymnasium_robotics
 from sb3_dtfm.policies import SequencePolicy
 
 # What `--conf-file` accepts besides files and Python packages; None is no `--conf-file` at all.
@@ -17,7 +18,12 @@ PACKAGED_CONFIGS = {None: "sb3_dtfm.zoo_configs", "small": "sb3_dtfm.zoo_configs
 
 
 def register() -> None:
-    """Add the algorithms in place, so that RL-Zoo's functions see them wherever they were imported."""
+    """
+    Add the algorithms in place, so that RL-Zoo's functions see them wherever they were imported.
+
+    So do tasks of gymnasium-robotics, which RL-Zoo does not know.
+    """
+    register_gymnasium_robotics()
     ALGOS.update(ALGORITHMS)
     HYPERPARAMS_SAMPLER.update({name: partial(sample_params, name) for name in ALGORITHMS})
     HYPERPARAMS_CONVERTER.update({name: partial(convert_params, name) for name in ALGORITHMS})

@@ -14,9 +14,8 @@ import pytest
 from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
 
-import sb3_dtfm.envs  # noqa: F401  (registers FetchReach)
 from sb3_dtfm.data import DatasetError, load_minari
-from sb3_dtfm.envs import ReturnToGoWrapper, return_to_go_space
+from sb3_dtfm.envs import ReturnToGoWrapper, register_gymnasium_robotics, return_to_go_space
 
 OBSERVATION_SPACE = spaces.Box(-np.inf, np.inf, (3,), np.float64)
 ACTION_SPACE = spaces.Box(-0.4, 0.4, (2,), np.float32)
@@ -98,6 +97,7 @@ def test_the_episodes_of_an_opened_dataset_are_the_chosen_ones():
 
 
 def test_goal_dict_is_flattened_as_the_wrapper_does():
+    register_gymnasium_robotics()
     env = gym.make("FetchReach-v4")
     wrapped = ReturnToGoWrapper(gym.make("FetchReach-v4"), 0.0)
     observations, vectors = [env.reset(seed=5)[0]], [wrapped.reset(seed=5)[0]["observation"]]

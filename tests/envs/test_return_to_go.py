@@ -15,8 +15,15 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_dtfm.data import load_minari
-from sb3_dtfm.envs import ReturnToGoWrapper, flatten_observation_space, return_to_go_space
+from sb3_dtfm.envs import (
+    ReturnToGoWrapper,
+    flatten_observation_space,
+    register_gymnasium_robotics,
+    return_to_go_space,
+)
 from sb3_dtfm.recording.agent import record_agent
+
+register_gymnasium_robotics()
 
 
 class ConstantReward(gym.Env):

@@ -12,7 +12,6 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-import sb3_dtfm.envs  # noqa: F401  (registers FetchReach)
 from sb3_dtfm.data import DatasetError, load_minari
 from sb3_dtfm.recording.agent import record_agent
 

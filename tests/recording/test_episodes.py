@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from sb3_dtfm.envs import register_gymnasium_robotics
 from sb3_dtfm.recording.episodes import EpisodeRecorder, run_episodes
 
 
@@ -76,6 +77,7 @@ def test_episodes_come_in_the_order_of_their_seeds():
 
 @pytest.mark.parametrize(("env_id", "success"), [("AdroitHandDoor-v1", False), ("HalfCheetah-v5", None)])
 def test_success_is_what_the_environment_says_or_nothing(env_id: str, success: bool | None):
+    register_gymnasium_robotics()
     with EpisodeRecorder(gym.make(env_id, max_episode_steps=2)) as env:
         (episode,) = run_episodes([env], lambda _, __, numbers: np.zeros((len(numbers), *env.action_space.shape)), [0])
     assert episode.truncated
