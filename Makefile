@@ -49,7 +49,7 @@ $(STAMP): pyproject.toml constraints.txt
 	$$python -m venv $(VENV)
 	@$(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt -e ".[all,dev]" || { \
 		echo "The installation failed. robosuite needs evdev, which pip builds: that takes a C compiler, Python's headers" >&2; \
-		echo "(python3-dev) and the kernel's (linux-libc-dev). docs/guide.md, 'Without a compiler', installs without it." >&2; \
+		echo "(python3-dev) and the kernel's (linux-libc-dev). docs/howto/install.md says how to install without it." >&2; \
 		exit 1; \
 	}
 	@touch $@
