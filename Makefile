@@ -1,18 +1,18 @@
 .DELETE_ON_ERROR:
-.PHONY: help install demo test test-all bench lowest highest audit licences format lint type clean
+.PHONY: help install demo test test-all bench lowest highest audit licences docs dist format lint type clean
 
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 # d3rlpy needs another gymnasium.
 PEERS := .venv-peers
-# What looks at dependencies, apart from them.
+# What looks at dependencies, makes the site and looks at what is published, apart from them.
 TOOLS := .venv-tools
 # Tests of each part that meets other packages.
 SMOKE := tests/cli/test_command_line.py tests/data/test_minari.py tests/envs/robosuite/test_env.py tests/files/test_model.py \
 	tests/files/test_onnx.py
 # What is checked and formatted besides the package.
-SOURCES := sb3_dtfm envs zoo_configs tests studies examples
+SOURCES := sb3_dtfm envs zoo_configs tests studies examples docs
 
 help:
 	@echo "make install  pinned environment in $(VENV), for Python 3.10 to 3.12"
@@ -23,6 +23,8 @@ help:
 	@echo "make lowest   tests of each part with the lowest versions that pyproject.toml allows; make highest: the highest"
 	@echo "make audit    ask for known vulnerabilities of the pinned versions; needs the network"
 	@echo "make licences write the table of docs/licences.md anew"
+	@echo "make docs     the site, into build/site"
+	@echo "make dist     source distribution and wheel, into dist/, as PyPI would take them"
 	@echo "make format   rewrite the sources in the project's format"
 	@echo "make lint     check format and style"
 	@echo "make type     check types"
@@ -90,10 +92,22 @@ licences: install $(TOOLS)/installed
 	$(TOOLS)/bin/pip-licenses --python $(BIN)/python --from=mixed --with-system --format=markdown \
 		--packages $$(sed '/^#/d; s/==.*//' constraints.txt | sort -u) | sed 's/  *|/ |/g; s/----*/---/g' >> docs/licences.md
 
+# Strict: a link or an anchor that leads nowhere is an error.
+docs: $(TOOLS)/installed
+	NO_MKDOCS_2_WARNING=1 $(TOOLS)/bin/mkdocs build --quiet --strict
+
+# The wheel is built from the source distribution, so that both are known to be whole.
+dist: $(TOOLS)/installed
+	rm -rf dist build/lib
+	$(TOOLS)/bin/python -m build --outdir dist
+	$(TOOLS)/bin/twine check --strict dist/*
+
 $(TOOLS)/installed: Makefile | install
 	rm -rf $(TOOLS)
 	$(BIN)/python -m venv $(TOOLS)
-	$(TOOLS)/bin/pip install --disable-pip-version-check --quiet pip-audit==2.10.1 pip-licenses==5.5.5 uv==0.13.9
+	$(TOOLS)/bin/pip install --disable-pip-version-check --quiet pip-audit==2.10.1 pip-licenses==5.5.5 uv==0.13.9 \
+		mkdocs-material==9.8.1 "mkdocstrings[python]==1.0.8" mkdocstrings-python==2.0.11 latex2mathml==3.81.1 \
+		build==1.6.1 twine==7.0.0
 	@touch $@
 
 format: install
