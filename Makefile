@@ -1,5 +1,5 @@
 .DELETE_ON_ERROR:
-.PHONY: help install demo test test-all bench lowest highest audit licences docs dist format lint type clean
+.PHONY: help install demo test test-all bench lowest highest audit licences docs dist format lint type linked clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -93,8 +93,8 @@ licences: install $(TOOLS)/installed
 		--packages $$(sed '/^#/d; s/==.*//' constraints.txt | sort -u) | sed 's/  *|/ |/g; s/----*/---/g' >> docs/licences.md
 
 # Strict: a link or an anchor that leads nowhere is an error.
-docs: $(TOOLS)/installed
-	NO_MKDOCS_2_WARNING=1 $(TOOLS)/bin/mkdocs build --quiet --strict
+docs: $(TOOLS)/installed linked
+	NO_MKDOCS_2_WARNING=1 $(TOOLS)/bin/mkdocs build --strict
 
 # The wheel is built from the source distribution, so that both are known to be whole.
 dist: $(TOOLS)/installed
@@ -118,12 +118,14 @@ lint: install
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/ruff check $(SOURCES)
 
-# mypy reads folders: it gets the package put together by links, as an installation would have it.
-type: install
-	@rm -rf build/typing && mkdir -p build/typing/sb3_dtfm
-	@ln -s $(CURDIR)/sb3_dtfm/* build/typing/sb3_dtfm/
-	@ln -s $(CURDIR)/envs $(CURDIR)/zoo_configs build/typing/sb3_dtfm/
-	cd build/typing && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache
+type: install linked
+	cd build/linked && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache
+
+# Who reads folders gets the package put together by links, as an installation would have it.
+linked:
+	@rm -rf build/linked && mkdir -p build/linked/sb3_dtfm
+	@ln -s $(CURDIR)/sb3_dtfm/* build/linked/sb3_dtfm/
+	@ln -s $(CURDIR)/envs $(CURDIR)/zoo_configs build/linked/sb3_dtfm/
 
 clean:
 	rm -rf $(VENV) $(PEERS) $(TOOLS) .venv-lowest .venv-highest build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
