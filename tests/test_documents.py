@@ -36,12 +36,19 @@ from sb3_dtfm.zoo.manager import OF_RL_ZOO
 
 ROOT = Path(__file__).parents[1]
 START = "docs/start.md"
+# They need no other page's files.
+FROM_NOTHING = (START, "README.md")
 PAGES = ["README.md", "CONTRIBUTING.md", *sorted(str(page.relative_to(ROOT)) for page in (ROOT / "docs").rglob("*.md"))]
 MARK = r"<!-- test: (\w+)(?:\. ([^>]*))? -->\n"
 FENCE = re.compile(rf"^( *)(?:{MARK}\1)?```([^\n]*)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 SHELL = ("", "sh")
 # What the fast tests take instead.
-FEWER = {"range(60)": "range(3)", "learn(500)": "learn(2)", "n_eval_episodes=10": "n_eval_episodes=1"}
+FEWER = {
+    "range(60)": "range(3)",
+    "learn(500)": "learn(2)",
+    "n_eval_episodes=10": "n_eval_episodes=1",
+    'make("MountainCarContinuous-v0")': 'make("MountainCarContinuous-v0", max_episode_steps=20)',
+}
 
 
 class Block(NamedTuple):
@@ -134,8 +141,8 @@ def test_the_start_runs_with_few_episodes(started):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", pages_with((*SHELL, "python"), "slow"))
-def test_a_page_runs_as_it_is_written(page, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_page_runs_as_it_is_written(page, started, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path if page in FROM_NOTHING else started)
     run(page, "run", "slow", fewer=False)
 
 
