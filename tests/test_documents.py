@@ -1,8 +1,8 @@
 """
 What README and docs/ show runs, block by block.
 
-Python is run, in the order of its page, in a folder that has what docs/start.md leaves behind. Of shell lines it is known that
-the command's own parser takes them. A comment before a block, `<!-- test: ... -->`, says otherwise:
+Python is run, in the order of its page, in a folder that has what docs/start.md leaves behind. Of shell lines it is known
+that the command's own parser takes them. A comment before a block, `<!-- test: ... -->`, says otherwise:
 
 - `run`: the shell lines are run, too;
 - `slow`: run as a slow test only;
@@ -12,7 +12,6 @@ Slow tests run whole pages as they are written, where the fast ones take smaller
 """
 
 import argparse
-import contextlib
 import importlib
 import inspect
 import re
@@ -20,7 +19,7 @@ import runpy
 import shlex
 import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Callable
 from importlib.metadata import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -153,22 +152,22 @@ def test_what_is_not_run_is_python(page):
             compile(block.code, page, "exec")
 
 
-class Understood(Exception):
-    """A parser took its arguments; the command would begin now."""
+class ParsedError(Exception):
+    """A parser took its arguments, which these are; the command would begin now."""
 
 
-@contextlib.contextmanager
-def parsing_only() -> Iterator[None]:
-    """Let a command go as far as its arguments are parsed."""
+def parse_only(command: Callable[[], Any]) -> None:
+    """Call a command that ends where its arguments are parsed."""
     parse_args = argparse.ArgumentParser.parse_args
 
     def parse(self: argparse.ArgumentParser, *args: Any, **kwargs: Any) -> None:
-        raise Understood(parse_args(self, *args, **kwargs))
+        raise ParsedError(parse_args(self, *args, **kwargs))
 
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(Understood) as understood:
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(argparse.ArgumentParser, "parse_args", parse)
-        yield
-    check_hyperparameters(understood.value.args[0])
+        with pytest.raises(ParsedError) as parsed:
+            command()
+    check_hyperparameters(parsed.value.args[0])
 
 
 def check_hyperparameters(options: argparse.Namespace) -> None:
@@ -191,18 +190,19 @@ def understand(words: list[str]) -> None:
     program, *arguments = words
     if program == "sb3-dtfm":
         assert arguments[0] in COMMANDS
-        with parsing_only():
-            importlib.import_module(f"sb3_dtfm.cli.{arguments[0]}").main(arguments[1:])
+        command = importlib.import_module(f"sb3_dtfm.cli.{arguments[0]}").main
+        parse_only(lambda: command(arguments[1:]))
     elif program == "torchrun":
         options = get_args_parser().parse_args(arguments)
         assert options.module
         assert options.training_script == "sb3_dtfm"
         understand(["sb3-dtfm", *options.training_script_args])
     elif program == "python":
-        with parsing_only(), pytest.MonkeyPatch.context() as patch:
+        script = ROOT / arguments[0]
+        with pytest.MonkeyPatch.context() as patch:
             patch.setattr(sys, "argv", arguments)
-            patch.syspath_prepend(str((ROOT / arguments[0]).parent))
-            runpy.run_path(str(ROOT / arguments[0]), run_name="__main__")
+            patch.syspath_prepend(str(script.parent))
+            parse_only(lambda: runpy.run_path(str(script), run_name="__main__"))
     elif program == "make":
         targets = re.findall(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)[0].split()
         assert set(arguments) <= set(targets)
