@@ -1,5 +1,5 @@
 """
-What MkDocs does not do by itself: files beside docs/ that the pages link, and equations without JavaScript.
+What MkDocs does not do by itself: files beside docs/ that the pages link, equations without JavaScript, docstrings' roles.
 
 The site holds docs/ at its root, and each linked file beside it under its own path; of a linked folder, its README.
 """
@@ -17,6 +17,8 @@ from mkdocs.structure.pages import Page
 ROOT = Path(__file__).parents[1]
 LINK = re.compile(r"(?<=\]\()([^)#\s:]+)(?=[)#])")
 EQUATION = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
+# What docstrings link, as Sphinx writes it.
+ROLE = re.compile(r":(?:class|func|meth):<code>(~?)([\w.]+)</code>")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -41,13 +43,17 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def on_page_content(content: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """LaTeX becomes MathML, which browsers show."""
+    """LaTeX becomes MathML, which browsers show; roles become links, where the page they name is there."""
 
     def math(equation: re.Match[str]) -> str:
         display = "block" if equation[1] == "div" else "inline"
         return convert(html.unescape(equation[2]), display=display)
 
-    return EQUATION.sub(math, content)
+    def link(role: re.Match[str]) -> str:
+        name = role[2].rpartition(".")[2] if role[1] else role[2]
+        return f'<autoref optional identifier="{role[2]}"><code>{name}</code></autoref>'
+
+    return ROLE.sub(link, EQUATION.sub(math, content))
 
 
 def _source(page: str) -> str:
