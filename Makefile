@@ -106,8 +106,8 @@ $(TOOLS)/installed: Makefile | install
 	rm -rf $(TOOLS)
 	$(BIN)/python -m venv $(TOOLS)
 	$(TOOLS)/bin/pip install --disable-pip-version-check --quiet pip-audit==2.10.1 pip-licenses==5.5.5 uv==0.13.9 \
-		mkdocs-material==9.7.7 mkdocstrings==1.0.6 mkdocstrings-python==2.0.9 latex2mathml==3.81.1 \
-		build==1.6.1 ruff==$$(sed -n 's/^ruff==//p' constraints.txt) twine==7.0.0
+		mkdocs-material==9.7.7 mkdocstrings==1.0.6 mkdocstrings-python==2.0.9 pymdown-extensions==11.0.2 \
+		latex2mathml==3.81.1 build==1.6.1 ruff==$$(sed -n 's/^ruff==//p' constraints.txt) twine==7.0.0
 	@touch $@
 
 format: install
