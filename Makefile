@@ -1,18 +1,18 @@
 .DELETE_ON_ERROR:
-.PHONY: help install demo test test-all bench lowest highest audit licences format lint type clean
+.PHONY: help install demo test test-all bench lowest highest audit licences docs dist format lint type linked clean
 
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 # d3rlpy needs another gymnasium.
 PEERS := .venv-peers
-# What looks at dependencies, apart from them.
+# What looks at dependencies, makes the site and looks at what is published, apart from them.
 TOOLS := .venv-tools
 # Tests of each part that meets other packages.
 SMOKE := tests/cli/test_command_line.py tests/data/test_minari.py tests/envs/robosuite/test_env.py tests/files/test_model.py \
 	tests/files/test_onnx.py
 # What is checked and formatted besides the package.
-SOURCES := sb3_dtfm envs zoo_configs tests studies examples
+SOURCES := sb3_dtfm envs zoo_configs tests studies examples docs
 
 help:
 	@echo "make install  pinned environment in $(VENV), for Python 3.10 to 3.12"
@@ -23,6 +23,8 @@ help:
 	@echo "make lowest   tests of each part with the lowest versions that pyproject.toml allows; make highest: the highest"
 	@echo "make audit    ask for known vulnerabilities of the pinned versions; needs the network"
 	@echo "make licences write the table of docs/licences.md anew"
+	@echo "make docs     the site, into build/site"
+	@echo "make dist     source distribution and wheel, into dist/, as PyPI would take them"
 	@echo "make format   rewrite the sources in the project's format"
 	@echo "make lint     check format and style"
 	@echo "make type     check types"
@@ -49,7 +51,7 @@ $(STAMP): pyproject.toml constraints.txt
 	$$python -m venv $(VENV)
 	@$(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt -e ".[all,dev]" || { \
 		echo "The installation failed. robosuite needs evdev, which pip builds: that takes a C compiler, Python's headers" >&2; \
-		echo "(python3-dev) and the kernel's (linux-libc-dev). docs/guide.md, 'Without a compiler', installs without it." >&2; \
+		echo "(python3-dev) and the kernel's (linux-libc-dev). docs/howto/install.md says how to install without it." >&2; \
 		exit 1; \
 	}
 	@touch $@
@@ -90,10 +92,22 @@ licences: install $(TOOLS)/installed
 	$(TOOLS)/bin/pip-licenses --python $(BIN)/python --from=mixed --with-system --format=markdown \
 		--packages $$(sed '/^#/d; s/==.*//' constraints.txt | sort -u) | sed 's/  *|/ |/g; s/----*/---/g' >> docs/licences.md
 
+# Strict: a link or an anchor that leads nowhere is an error.
+docs: $(TOOLS)/installed linked
+	NO_MKDOCS_2_WARNING=1 $(TOOLS)/bin/mkdocs build --strict
+
+# The wheel is built from the source distribution, so that both are known to be whole.
+dist: $(TOOLS)/installed
+	rm -rf dist build/lib
+	$(TOOLS)/bin/python -m build --outdir dist
+	$(TOOLS)/bin/twine check --strict dist/*
+
 $(TOOLS)/installed: Makefile | install
 	rm -rf $(TOOLS)
 	$(BIN)/python -m venv $(TOOLS)
-	$(TOOLS)/bin/pip install --disable-pip-version-check --quiet pip-audit==2.10.1 pip-licenses==5.5.5 uv==0.13.9
+	$(TOOLS)/bin/pip install --disable-pip-version-check --quiet pip-audit==2.10.1 pip-licenses==5.5.5 uv==0.13.9 \
+		mkdocs-material==9.7.7 mkdocstrings==1.0.6 mkdocstrings-python==2.0.9 pymdown-extensions==11.0.2 \
+		latex2mathml==3.81.1 build==1.6.1 ruff==$$(sed -n 's/^ruff==//p' constraints.txt) twine==7.0.0
 	@touch $@
 
 format: install
@@ -104,12 +118,14 @@ lint: install
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/ruff check $(SOURCES)
 
-# mypy reads folders: it gets the package put together by links, as an installation would have it.
-type: install
-	@rm -rf build/typing && mkdir -p build/typing/sb3_dtfm
-	@ln -s $(CURDIR)/sb3_dtfm/* build/typing/sb3_dtfm/
-	@ln -s $(CURDIR)/envs $(CURDIR)/zoo_configs build/typing/sb3_dtfm/
-	cd build/typing && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache
+type: install linked
+	cd build/linked && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache
+
+# Who reads folders gets the package put together by links, as an installation would have it.
+linked:
+	@rm -rf build/linked && mkdir -p build/linked/sb3_dtfm
+	@ln -s $(CURDIR)/sb3_dtfm/* build/linked/sb3_dtfm/
+	@ln -s $(CURDIR)/envs $(CURDIR)/zoo_configs build/linked/sb3_dtfm/
 
 clean:
 	rm -rf $(VENV) $(PEERS) $(TOOLS) .venv-lowest .venv-highest build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -1,14 +1,17 @@
-"""The built wheel: what is in it, and that it works by itself, away from the sources."""
+"""What is published: what is in it, and that the wheel works by itself, away from the sources."""
 
 import os
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 
+from sb3_dtfm import __version__
 from tests.recorded import DATASET_ID, tiny_training
 
 ROOT = Path(__file__).parents[2]
@@ -22,15 +25,32 @@ def run(*command: str, **kwargs) -> str:
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory) -> Path:
-    """Built from a copy, where no earlier build can add files."""
+def built(tmp_path_factory) -> Path:
+    """Source distribution, and the wheel built from it; from a copy, where no earlier build can add files."""
     source, output = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("dist")
-    for name in ("sb3_dtfm", "envs", "zoo_configs"):
+    for name in ("sb3_dtfm", "envs", "zoo_configs", "tests"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
-    run(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(output), str(source))
-    return next(output.glob("*.whl"))
+    for path in filter(Path.is_file, ROOT.iterdir()):
+        shutil.copy(path, source)
+    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", str(output), str(source))
+    return output
+
+
+@pytest.fixture(scope="module")
+def wheel(built) -> Path:
+    return next(built.glob("*.whl"))
+
+
+def test_the_source_distribution_holds_what_a_wheel_needs_and_no_tests(built):
+    with tarfile.open(next(built.glob("*.tar.gz"))) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    assert names >= {"pyproject.toml", "README.md", "LICENSE", "CITATION.cff", "envs/__init__.py", "zoo_configs/dt.yml"}
+    assert not [name for name in names if name.startswith(("tests", "results", "docs"))]
+
+
+def test_the_version_is_the_one_of_the_package(built):
+    assert {path.name.split("-")[1].removesuffix(".tar.gz") for path in built.iterdir()} == {__version__}
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == __version__
 
 
 def test_the_wheel_holds_the_package_and_its_settings_only(wheel):
