@@ -1,7 +1,7 @@
 """
 Actions as vectors of numbers, which is all that data and networks know of them.
 
-Those of a Box are vectors. Those of a Discrete space, of n choices, become n numbers: 1 for the one that is chosen, 0 for others.
+Those of a Box are vectors. One of a Discrete space's n actions becomes n numbers: 1 for it, 0 for the others.
 """
 
 from typing import Any, TypeAlias

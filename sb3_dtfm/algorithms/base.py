@@ -235,8 +235,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         if ours.shape != theirs.shape:
             raise DatasetError(f"{found} observations of {theirs}, {expected} {ours}.")
         same_bounds = self.action_space.shape == action_space.shape and all(
-            np.allclose(ours, theirs)
-            for ours, theirs in zip(bounds_of(self.action_space), bounds_of(action_space), strict=True)
+            np.allclose(bound, other)
+            for bound, other in zip(bounds_of(self.action_space), bounds_of(action_space), strict=True)
         )
         if not same_bounds:
             raise DatasetError(f"{found} actions of {action_space}, {expected} {self.action_space}.")

@@ -93,11 +93,11 @@ def load_flat(
     """
     Episodes one after the other in flat arrays of N steps: as `numpy.savez` writes them, in D4RL's hdf5 files, or in memory.
 
-    Read are `observations` (N, O), `actions` (N, A), or whole numbers (N,) of a Discrete space, and `rewards` (N,), or what others call them (`obs`, `state`, `action`,
-    `reward`). Episodes end where `episode_ends` says (E,), counting steps from the start of the file, or after
-    `episode_lengths` (E,) each, or at the steps of `terminals` or `timeouts` (N,). Without rewards every episode counts as a
-    success: a reward of 1 at its last step. Nothing in a file is ever executed: arrays of Python objects are refused. The
-    arrays are read into memory, also to write a cache of them.
+    Read are `observations` (N, O), `actions` (N, A), or whole numbers (N,) of a Discrete space, and `rewards` (N,), or what
+    others call them (`obs`, `state`, `action`, `reward`). Episodes end where `episode_ends` says (E,), counting steps from
+    the start of the file, or after `episode_lengths` (E,) each, or at the steps of `terminals` or `timeouts` (N,). Without
+    rewards every episode counts as a success: a reward of 1 at its last step. Nothing in a file is ever executed: arrays of
+    Python objects are refused. The arrays are read into memory, also to write a cache of them.
 
     :param dataset: path of the file, or arrays by name
     :param observation_keys: which arrays make up the observation, in this order, each (N, ...)
@@ -385,7 +385,7 @@ def bounded_space(bounds: Sequence[Any] | None, space: ActionSpace | None, actio
             return choices_between(first, last)
         low, high = (np.broadcast_to(np.asarray(bound, np.float32), n_actions) for bound in bounds or (-1.0, 1.0))
         return spaces.Box(low, high, dtype=np.float32)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         expected = f"numbers or {n_actions[0]} each" if n_actions else "whole numbers"
         raise DatasetError(
             f"{source}: action_bounds is {bounds!r}; smallest and largest action are expected, {expected}."

@@ -48,8 +48,9 @@ def load_episodes(
     """
     Episodes one by one, each of which may be
 
-    - a dictionary of `observations` (T, O) or (T + 1, O), `actions` (T, A), or (T,) of a Discrete space, `rewards` (T,), and `terminated` and
-      `truncated`, for the episode or for each step, or what others call them; observations may be dictionaries, too
+    - a dictionary of `observations` (T, O) or (T + 1, O), `actions` (T, A), or (T,) of a Discrete space, `rewards` (T,), and
+      `terminated` and `truncated`, for the episode or for each step, or what others call them; observations may be
+      dictionaries, too
     - a :class:`~sb3_dtfm.data.Trajectory`
     - a trajectory of the package imitation: `obs`, `acts`, `terminal`, `rews` where it has some
     - a list of steps `(observation, action, reward, terminated, truncated)`, as they come from a Gymnasium environment:
@@ -170,7 +171,7 @@ def load_replay_buffer(
     """
     The episodes of a replay buffer, such as `model.replay_buffer` of an SB3 model, environment by environment.
 
-    SB3's algorithms store actions of a Box scaled to [-1, 1]; they are brought back into the range of the buffer's action space.
+    SB3's algorithms store actions of a Box scaled to [-1, 1]; they are brought back into the buffer's action space.
     Observations and rewards are there as the environment gave them, `VecNormalize` or not. An episode at whose end
     `TimeLimit.truncated` was said is truncated. The last one of each environment stops where the buffer does; of a full
     buffer, the first one of each environment is left out, since its beginning has been written over.

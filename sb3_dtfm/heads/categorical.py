@@ -10,8 +10,8 @@ class CategoricalHead(ActionHead):
     """
     A linear map of the hidden state to the logits of n choices, by cross-entropy.
 
-    An action is n numbers, 1 for the choice and -1 for the others. The choice is the largest sum of a logit and Gumbel noise,
-    which is a draw from the softmax of the logits (Gumbel, 1954); where the noise is the same for all, the most likely one.
+    An action is n numbers, 1 for the choice and -1 for the others. The choice is the one whose logit and Gumbel noise have
+    the largest sum: a draw from the softmax of the logits, and the most likely choice where the noise is zero.
 
     :param embed_dim: D
     :param action_dim: n
@@ -40,5 +40,5 @@ class CategoricalHead(ActionHead):
 
 
 def gumbel(noise: th.Tensor) -> th.Tensor:
-    """Standard normal noise as standard Gumbel noise, by way of the probability that a smaller number is drawn."""
+    """Standard normal noise (...) as standard Gumbel noise (...), by way of the probability that a smaller one is drawn."""
     return -(-th.special.log_ndtr(noise)).log()

@@ -23,7 +23,8 @@ REFUSED = {
     "zero width": spaces.Box(np.array([-1.0, 0.5], np.float32), np.array([1.0, 0.5], np.float32)),
     "two axes": spaces.Box(-1.0, 1.0, (2, 3), np.float32),
     "integer": spaces.Box(0, 5, (2,), np.int64),
-    "discrete": spaces.Discrete(3),
+    "several discrete": spaces.MultiDiscrete([3, 2]),
+    "binary": spaces.MultiBinary(2),
 }
 
 
