@@ -10,8 +10,8 @@ from sb3_dtfm.data.trajectories import ScoreReference
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Paths in a picture of the flow.
-N_PATHS = 300
+# Paths in a picture of the flow, and how far it reaches: what little noise lies beyond only makes the rest small.
+N_PATHS, REACH = 300, 2.2
 
 
 def find_eval_callbacks(callback: BaseCallback | None) -> list[EvalCallback]:
@@ -191,10 +191,11 @@ def draw_flow(policy: Any, window: Any, seed: int = 0) -> "Figure":
         paths = head.paths(hidden.expand(N_PATHS, -1), noise).cpu()
     figure = Figure(figsize=(4.4, 4.4), layout="constrained")
     axis = figure.subplots()
-    axis.plot(*paths.permute(2, 0, 1), color="0.8", linewidth=0.5)
-    axis.scatter(*paths[0].T, s=6, color="#999999", label="noise, tau = 0", zorder=2)
+    axis.plot(*paths.permute(2, 0, 1), color="0.8", linewidth=0.6)
+    axis.scatter(*paths[0].T, s=5, color="#999999", label="noise, tau = 0", zorder=2)
     axis.scatter(*paths[-1].T, s=6, color="#0072B2", label="actions, tau = 1", zorder=3)
     axis.set(xlabel="first number of the action", ylabel="second number", aspect="equal")
+    axis.set(xlim=(-REACH, REACH), ylim=(-REACH, REACH))
     axis.legend(frameon=False, fontsize="small", loc="upper right")
     axis.spines[["top", "right"]].set_visible(False)
     return figure

@@ -17,8 +17,9 @@ from sb3_dtfm import DT, DTFM
 from sb3_dtfm.callbacks import draw_flow
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 
-N_EPISODES, N_STEPS = 400, 600
-LEFT, RIGHT, SPREAD = (-0.6, 0.3), (0.6, 0.3), 0.07
+N_EPISODES = 400
+N_STEPS = {DTFM: 1500, DT: 300}
+LEFT, RIGHT, SPREAD = (-0.8, 0.3), (0.8, 0.3), 0.07
 TRUNK = dict(embed_dim=32, n_layers=1, n_heads=1, dropout=0.0)
 
 
@@ -36,14 +37,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=Path("docs/images/flow.png"))
     options = parser.parse_args()
-    settings = dict(dataset=demonstrations(), context_length=1, batch_size=128, learning_rate=2e-3, seed=0, device="cpu")
+    settings = dict(
+        dataset=demonstrations(),
+        context_length=1,
+        batch_size=128,
+        learning_rate=2e-3,
+        learning_rate_schedule="cosine",
+        seed=0,
+        device="cpu",
+    )
     flow = dict(flow_hidden_dim=64, flow_n_layers=2, one_step=False)
     models = {
-        algorithm: algorithm("MultiInputPolicy", **settings, policy_kwargs={**TRUNK, **kwargs}).learn(N_STEPS)
+        algorithm: algorithm("MultiInputPolicy", **settings, policy_kwargs={**TRUNK, **kwargs}).learn(N_STEPS[algorithm])
         for algorithm, kwargs in ((DTFM, flow), (DT, {}))
     }
-    buffer = models[DTFM].buffer
-    window = buffer.windows(th.zeros(1, dtype=th.int64), 1)
+    window = models[DTFM].buffer.windows(th.zeros(1, dtype=th.int64), 1)
     observation = {
         "observation": window.observations[0, 0].numpy(),
         "return_to_go": window.returns_to_go[0].numpy(),
@@ -52,9 +60,8 @@ def main() -> None:
     action, _ = models[DT].predict(observation, deterministic=True)
     figure = draw_flow(models[DTFM].policy, window)
     (axis,) = figure.axes
-    axis.scatter(*buffer.actions.T, s=5, marker="x", linewidths=0.5, color="#E69F00", label="recorded actions", zorder=1.5)
     axis.scatter(*action, s=90, marker="*", color="#D55E00", label="DT's action", zorder=4)
-    axis.legend(frameon=False, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, 1.12), ncols=2)
+    axis.legend(frameon=False, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, 1.1), ncols=3)
     options.output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(options.output, dpi=130)
     print(options.output)
