@@ -183,7 +183,8 @@ def draw_flow(policy: Any, window: Any, seed: int = 0) -> "Figure":
 
     head = policy.acting_network.head
     if not hasattr(head, "paths") or head.noise_dim != 2:
-        raise ValueError(f"a flow in two dimensions is drawn; this head starts from {head.noise_dim} numbers of noise.")
+        found = f"the head is a {type(head).__name__} that starts from {head.noise_dim} numbers of noise"
+        raise ValueError(f"Only a flow of two numbers can be drawn; {found}.")
     policy.set_training_mode(False)
     with th.no_grad():
         hidden = policy.hidden_states(policy.acting_network, policy.scaled_windows(window), last_only=True)[0]
