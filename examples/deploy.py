@@ -32,14 +32,14 @@ class Policy:
         self.inputs = {name: np.zeros(shape, dtype) for name, (shape, dtype) in shapes.items()}
         self.plan: list[np.ndarray] = []
 
-    def act(self, observation: np.ndarray, return_to_go: float, timestep: int) -> np.ndarray:
+    def act(self, observation: np.ndarray, return_to_go: float, timestep: int) -> np.ndarray | np.int64:
         """
         The next action, as `predict(deterministic=True)` chooses it; time step 0 begins an episode.
 
         :param observation: (O,)
         :param return_to_go: target return less the rewards so far
         :param timestep: counted from the episode's start
-        :return: (A,) in the environment's range
+        :return: (A,) in the environment's range, or a number where its action space is Discrete
         """
         if timestep == 0:
             self.inputs["mask"][:], self.plan = False, []
@@ -54,7 +54,8 @@ class Policy:
             self.inputs.update(zip(["keys_values"], kept, strict=False))
             self.plan = self.plan or list(chunk[0, : self.settings["n_action_steps"]])
         self.inputs["actions"][:, -1] = action = self.plan.pop(0)
-        return action
+        first = self.settings["first_action"]
+        return action if first is None else first + action.argmax()
 
 
 def main() -> None:

@@ -1,8 +1,17 @@
 """What the learn loop adds to Stable-Baselines3's own callbacks."""
 
+from typing import TYPE_CHECKING, Any
+
+import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EventCallback, ProgressBarCallback
 
 from sb3_dtfm.data.trajectories import ScoreReference
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Paths in a picture of the flow, and how far it reaches: what little noise lies beyond only makes the rest small.
+N_PATHS, REACH = 300, 2.2
 
 
 def find_eval_callbacks(callback: BaseCallback | None) -> list[EvalCallback]:
@@ -135,3 +144,59 @@ class NormalizedScoreCallback(BaseCallback):
                 self._seen[i] = evaluation._is_success_buffer
                 self.logger.record("eval/normalized_score", self.score_reference.normalize(evaluation.last_mean_reward))
                 self.logger.dump(self.num_timesteps)
+
+
+class FlowFigure(BaseCallback):
+    """
+    Log a picture of the flow, `eval/flow`, of actions of two numbers: `EvalCallback(..., callback_after_eval=FlowFigure())`.
+
+    Each picture shows the same recorded window, so that they tell how the flow changes while it is learned.
+
+    :param seed: which window, and which noise
+    """
+
+    def __init__(self, seed: int = 0) -> None:
+        super().__init__()
+        self.seed = seed
+
+    def _on_step(self) -> bool:
+        from stable_baselines3.common import logger
+
+        model: Any = self.model
+        window = model.buffer.sample(1, model.context_length, th.Generator(model.device).manual_seed(self.seed))
+        picture = logger.Figure(draw_flow(model.policy, window, self.seed), close=True)
+        self.logger.record("eval/flow", picture, exclude=("stdout", "log", "json", "csv"))
+        self.logger.dump(self.num_timesteps)  # the evaluation's own numbers have been
+        return True
+
+
+def draw_flow(policy: Any, window: Any, seed: int = 0) -> "Figure":
+    """
+    Where a flow takes noise, for the newest step of a window.
+
+    :param policy: DTFM's, of actions of two numbers, one a step
+    :param window: of a buffer, (1, K, ...)
+    :param seed: of the noise
+    :raises ValueError: other actions, or no flow
+    """
+    from matplotlib.figure import Figure
+
+    head = policy.acting_network.head
+    if not hasattr(head, "paths") or head.noise_dim != 2:
+        found = f"the head is a {type(head).__name__} that starts from {head.noise_dim} numbers of noise"
+        raise ValueError(f"Only a flow of two numbers can be drawn; {found}.")
+    policy.set_training_mode(False)
+    with th.no_grad():
+        hidden = policy.hidden_states(policy.acting_network, policy.scaled_windows(window), last_only=True)[0]
+        noise = th.randn(N_PATHS, 2, generator=th.Generator().manual_seed(seed)).to(hidden.device)
+        paths = head.paths(hidden.expand(N_PATHS, -1), noise).cpu()
+    figure = Figure(figsize=(4.4, 4.4), layout="constrained")
+    axis = figure.subplots()
+    axis.plot(*paths.permute(2, 0, 1), color="0.8", linewidth=0.6)
+    axis.scatter(paths[0, :, 0], paths[0, :, 1], s=5, color="#999999", label="noise, tau = 0", zorder=2)
+    axis.scatter(paths[-1, :, 0], paths[-1, :, 1], s=6, color="#0072B2", label="actions, tau = 1", zorder=3)
+    axis.set(xlabel="first number of the action", ylabel="second number", aspect="equal")
+    axis.set(xlim=(-REACH, REACH), ylim=(-REACH, REACH))
+    axis.legend(frameon=False, fontsize="small", loc="upper right")
+    axis.spines[["top", "right"]].set_visible(False)
+    return figure

@@ -18,12 +18,13 @@ ROOMS = {
     "networks": ("sb3_dtfm/networks", {"networks"}),
     "windows": ("sb3_dtfm/windows.py", set()),
     "arguments": ("sb3_dtfm/arguments.py", set()),
+    "actions": ("sb3_dtfm/actions.py", set()),
     "files": ("sb3_dtfm/files", {"files"}),
     "heads": ("sb3_dtfm/heads", {"heads", "networks", "arguments"}),
     "envs": ("envs", {"envs"}),
-    "data": ("sb3_dtfm/data", {"arguments", "data", "envs", "files", "windows"}),
-    "recording": ("sb3_dtfm/recording", {"recording", "algorithms", "envs", "data", "files"}),
-    "policies": ("sb3_dtfm/policies", {"networks", "heads", "windows", "arguments", "policies"}),
+    "data": ("sb3_dtfm/data", {"actions", "arguments", "data", "envs", "files", "windows"}),
+    "recording": ("sb3_dtfm/recording", {"recording", "actions", "algorithms", "envs", "data", "files"}),
+    "policies": ("sb3_dtfm/policies", {"networks", "heads", "windows", "actions", "arguments", "policies"}),
     "callbacks": ("sb3_dtfm/callbacks.py", {"data"}),
     "optimization": ("sb3_dtfm/optimization.py", set()),
     "distributed": ("sb3_dtfm/distributed.py", {"windows"}),
@@ -36,6 +37,7 @@ ROOMS = {
             "data",
             "envs",
             "windows",
+            "actions",
             "arguments",
             "callbacks",
             "optimization",
@@ -45,7 +47,7 @@ ROOMS = {
     ),
     "zoo": ("sb3_dtfm/zoo", {"", "algorithms", "arguments", "policies", "callbacks", "envs", "distributed", "files", "zoo"}),
     "benchmark": ("sb3_dtfm/benchmark", {"", "algorithms", "data", "envs", "zoo", "benchmark", "files"}),
-    "cli": ("sb3_dtfm/cli", {"", "algorithms", "data", "envs", "recording", "zoo", "benchmark", "files", "cli"}),
+    "cli": ("sb3_dtfm/cli", {"", "actions", "algorithms", "data", "envs", "recording", "zoo", "benchmark", "files", "cli"}),
 }
 
 

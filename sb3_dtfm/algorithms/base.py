@@ -16,6 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule, TensorDict
 from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_dtfm.actions import ActionSpace, bounds_of
 from sb3_dtfm.algorithms.saving import (
     OPTIMIZER,
     POLICY,
@@ -106,7 +107,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
     """
 
     policy: SequencePolicy
-    action_space: spaces.Box
+    action_space: ActionSpace
 
     def __init__(
         self,
@@ -147,8 +148,10 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
             device=device,
             support_multi_env=True,
             seed=seed,
-            supported_action_spaces=(spaces.Box,),
+            supported_action_spaces=(spaces.Box, spaces.Discrete),
         )
+        if self.env is not None:
+            self._policy_class.head_for(self.action_space)  # before the data are read, which may take long
         self.dataset = dataset
         self.batch_size = batch_size
         self.weight_decay = weight_decay
@@ -222,7 +225,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         self.buffer = buffer.random_fraction(self.dataset_fraction, self.dataset_seed).to(self.device)
         return self.buffer
 
-    def _check_spaces(self, observation_space: spaces.Space, action_space: spaces.Box, found: str, expected: str) -> None:
+    def _check_spaces(self, observation_space: spaces.Space, action_space: ActionSpace, found: str, expected: str) -> None:
         """
         Compare with the model's spaces what the policy depends on: sizes, and the range of actions.
 
@@ -231,8 +234,9 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         ours, theirs = self.observation_space["observation"], observation_space["observation"]  # type: ignore[index]
         if ours.shape != theirs.shape:
             raise DatasetError(f"{found} observations of {theirs}, {expected} {ours}.")
-        same_bounds = self.action_space.shape == action_space.shape and (
-            np.allclose(self.action_space.low, action_space.low) and np.allclose(self.action_space.high, action_space.high)
+        same_bounds = self.action_space.shape == action_space.shape and all(
+            np.allclose(bound, other)
+            for bound, other in zip(bounds_of(self.action_space), bounds_of(action_space), strict=True)
         )
         if not same_bounds:
             raise DatasetError(f"{found} actions of {action_space}, {expected} {self.action_space}.")
@@ -254,9 +258,13 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         self.set_random_seed(self.seed)
         self.policy = self._make_policy(ema=self.ema_decay > 0).to(self.device)
 
-    def _make_policy(self, ema: bool) -> SequencePolicy:
+    @property
+    def _policy_class(self) -> type[SequencePolicy]:
         assert issubclass(self.policy_class, SequencePolicy)
-        return self.policy_class(
+        return self.policy_class
+
+    def _make_policy(self, ema: bool) -> SequencePolicy:
+        return self._policy_class(
             self.observation_space,  # type: ignore[arg-type]
             self.action_space,
             self.lr_schedule,

@@ -16,6 +16,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
 from sb3_dtfm.arguments import COUNT, Number, Rule, check_arguments
+from sb3_dtfm.data import check_action_space
 from sb3_dtfm.envs import OBSERVATION, RETURN_TO_GO, TIMESTEP
 from sb3_dtfm.files import ModelFileError
 from sb3_dtfm.optimization import RunningMeans
@@ -203,9 +204,8 @@ def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
     is_vector = {name: isinstance(part, spaces.Box) and len(part.shape) == 1 for name, part in parts.items()}
     if is_vector != dict.fromkeys((OBSERVATION, RETURN_TO_GO, TIMESTEP), True):
         raise ModelFileError(f"{source}: observation_space is {observation}, not what a ReturnToGoWrapper observes.")
-    bounded = isinstance(action, spaces.Box) and len(action.shape) == 1 and action.is_bounded()
-    if not bounded or not np.all(action.low < action.high):
-        raise ModelFileError(f"{source}: action_space is {action}, expected a bounded Box of shape (A,).")
+    with naming_the_file(source):
+        check_action_space(action, "action_space")
 
 
 def _space(described: str, what: str) -> spaces.Space:

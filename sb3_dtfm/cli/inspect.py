@@ -7,12 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 
+from sb3_dtfm.actions import ActionSpace
 from sb3_dtfm.cli.literals import key_value
 from sb3_dtfm.data import TrajectoryBuffer, load_dataset
 from sb3_dtfm.data.inspection import Inspection, Range, inspect_buffer
 
 BLUE, RED, GREY = "#1b6ca8", "#c0562b", "0.6"
+# Discrete actions that are counted in the table, the most frequent ones.
+N_CHOICES = 10
 # Episodes whose rewards are drawn.
 N_DRAWN = 50
 
@@ -64,16 +68,25 @@ def table(buffer: TrajectoryBuffer, found: Inspection) -> list[str]:
     ends = f"{buffer.terminated.sum()} terminated, {buffer.truncated.sum()} truncated, {n_stopped} just stop"
     spread = f"{lengths.min():,} to {lengths.max():,}, {np.median(lengths):,.6g} in the median"
     tenths = ", ".join(f"{each:,.6g}" for each in np.quantile(returns, (0.0, 0.1, 0.5, 0.9, 1.0)))
-    bounds = f"the space is {_interval(buffer.action_space.low, buffer.action_space.high)}, {found.at_bounds:.0%} at a bound"
     rows = {
         "task": buffer.env_id or "not said",
         "episodes": f"{buffer.n_episodes:,}: {ends}",
         "steps": f"{len(buffer):,}; an episode has {spread}",
         "returns": f"{returns.mean():,.6g} on average; worst, 10 %, median, 90 %, best: {tenths}",
         "observations": _numbers(found.observations),
-        "actions": f"{_numbers(found.actions)}; {bounds}",
+        "actions": _actions(buffer, found),
     }
     return [f"| {buffer.source} | |", "| --- | --- |", *(f"| {name} | {what} |" for name, what in rows.items())]
+
+
+def _actions(buffer: TrajectoryBuffer, found: Inspection) -> str:
+    space = buffer.action_space
+    if isinstance(space, spaces.Box):
+        bounds = f"the space is {_interval(space.low, space.high)}, {found.at_bounds:.0%} at a bound"
+        return f"{_numbers(found.actions)}; {bounds}"
+    often = np.argsort(-found.actions.mean, kind="stable")[:N_CHOICES]
+    counts = ", ".join(f"{space.start + i} in {found.actions.mean[i] * len(buffer):,.0f} steps" for i in often)
+    return f"{space}: {counts}{' ...' if space.n > N_CHOICES else ''}"
 
 
 def _numbers(found: Range) -> str:
@@ -95,7 +108,8 @@ def command(
     :param buffer: the dataset
     :param found: in it
     """
-    words = ["sb3-dtfm", "train", "--algo", "dtfm", "--env", buffer.env_id or "TASK", "--conf-file", "small"]
+    algo = "dtfm" if isinstance(buffer.action_space, spaces.Box) else "dt"
+    words = ["sb3-dtfm", "train", "--algo", algo, "--env", buffer.env_id or "TASK", "--conf-file", "small"]
     words += ["--dataset", *datasets, "--target-return", f"{found.target_return:g}"]
     if dataset_kwargs:
         inside = ", ".join(f"{key}={value!r}" for key, value in dataset_kwargs)
@@ -130,18 +144,26 @@ def draw(buffer: TrajectoryBuffer, found: Inspection, output: Path, title: str) 
         some = buffer.select(np.array([episode]))
         over_time.plot(some.returns_to_go[some.rows].cpu().numpy(), color=BLUE, alpha=0.35, linewidth=1.0)
     over_time.set(xlabel="step", ylabel="return-to-go")
-    dimensions = np.arange(len(found.actions.low))
-    space = buffer.action_space
-    actions.vlines(dimensions, space.low, space.high, color="0.9", linewidth=8.0, label="action space")
-    actions.vlines(dimensions, found.actions.low, found.actions.high, color=GREY, linewidth=3.0, label="used")
-    spread = (found.actions.mean + sign * found.actions.std for sign in (-1.0, 1.0))
-    spread = (np.clip(each, found.actions.low, found.actions.high) for each in spread)
-    actions.vlines(dimensions, *spread, color=BLUE, linewidth=5.0, label="usual")
-    actions.set(xlabel="dimension of the action", ylabel="action", xticks=dimensions if len(dimensions) <= 24 else [])
-    actions.legend(frameon=False, fontsize="small", loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
+    _draw_actions(actions, buffer.action_space, found.actions)
     for axis in (returns, lengths, over_time, actions):
         axis.spines[["top", "right"]].set_visible(False)
     figure.suptitle(title)
     output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(output, dpi=130)
     return output
+
+
+def _draw_actions(axis: Any, space: ActionSpace, found: Range) -> None:
+    """The range that is used of each dimension, or how often each of the Discrete actions was chosen."""
+    dimensions = np.arange(len(found.low))
+    if isinstance(space, spaces.Discrete):
+        axis.bar(space.start + dimensions, found.mean, color=BLUE)
+        axis.set(xlabel="action", ylabel="share of steps", xticks=space.start + dimensions if len(dimensions) <= 24 else [])
+        return
+    axis.vlines(dimensions, space.low, space.high, color="0.9", linewidth=8.0, label="action space")
+    axis.vlines(dimensions, found.low, found.high, color=GREY, linewidth=3.0, label="used")
+    spread = (found.mean + sign * found.std for sign in (-1.0, 1.0))
+    spread = (np.clip(each, found.low, found.high) for each in spread)
+    axis.vlines(dimensions, *spread, color=BLUE, linewidth=5.0, label="usual")
+    axis.set(xlabel="dimension of the action", ylabel="action", xticks=dimensions if len(dimensions) <= 24 else [])
+    axis.legend(frameon=False, fontsize="small", loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)

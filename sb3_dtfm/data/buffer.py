@@ -12,6 +12,7 @@ import torch as th
 from gymnasium import spaces
 from gymnasium.envs.registration import parse_env_id
 
+from sb3_dtfm.actions import ActionSpace, bounds_of, from_vectors, to_vectors, vector_space
 from sb3_dtfm.data.episodes import EpisodeTable, Statistics, moments
 from sb3_dtfm.data.storage import STEP_ARRAYS, FileStorage, MappedSteps, MemoryStorage
 from sb3_dtfm.data.trajectories import (
@@ -40,7 +41,8 @@ class TrajectoryBuffer:
     steps.
 
     :ivar observations: (N, O) float32
-    :ivar actions: (N, A) float32, in the environment's range
+    :ivar actions: (N, A) float32, in the environment's range; of a Discrete action space the vectors of
+        :func:`~sb3_dtfm.actions.to_vectors`
     :ivar rewards: (N,) float32, environment reward units
     :ivar returns_to_go: (N,) float32, environment reward units
     :ivar episodes: the buffer's episodes, one row each
@@ -55,7 +57,7 @@ class TrajectoryBuffer:
         tensors: dict[str, th.Tensor],
         episodes: EpisodeTable,
         observation_space: spaces.Box,
-        action_space: spaces.Box,
+        action_space: ActionSpace,
         source: str,
         score_reference: ScoreReference | None = None,
         env_id: str | None = None,
@@ -97,7 +99,7 @@ class TrajectoryBuffer:
     def from_trajectories(
         cls,
         trajectories: Iterable[Trajectory],
-        action_space: spaces.Box,
+        action_space: ActionSpace,
         observation_space: spaces.Box | None = None,
         n_steps: int | None = None,
         source: str = "trajectories",
@@ -112,7 +114,7 @@ class TrajectoryBuffer:
 
         :param trajectories: the episodes, at least one, each of at least one step; an iterator is read once, and may raise
             DatasetError for an episode and go on with the next, as `map` does
-        :param action_space: bounded Box of floats of shape (A,)
+        :param action_space: bounded Box of floats of shape (A,), or Discrete
         :param observation_space: Box of shape (O,); unbounded with the first episode's O if not given
         :param n_steps: steps of all episodes, where known beforehand, so that memory for them is taken once
         :param source: where the episodes come from, for messages
@@ -128,6 +130,7 @@ class TrajectoryBuffer:
         if on_invalid not in ON_INVALID:
             raise DatasetError(f"on_invalid must be one of {', '.join(ON_INVALID)}, got {on_invalid!r}.")
         action_space = check_action_space(action_space, source)
+        n_action_numbers = vector_space(action_space).shape[0]
         storage = storage or MemoryStorage()
         if n_steps is None and isinstance(trajectories, Sequence):
             n_steps = sum(map(len, trajectories))
@@ -141,7 +144,7 @@ class TrajectoryBuffer:
             space = observation_space or spaces.Box(-np.inf, np.inf, np.shape(trajectory.observations)[1:], np.float32)
             to_go = check_trajectory(trajectory, space, action_space, source)
             if n_stored is not None:
-                n_rows, n_columns = max(n_steps or 0, start + len(trajectory)), space.shape[0] + action_space.shape[0] + 2
+                n_rows, n_columns = max(n_steps or 0, start + len(trajectory)), space.shape[0] + n_action_numbers + 2
                 check_size(4 * n_rows * n_columns, n_stored, f"{source}: {n_rows} steps")
             observation_space = space
             return to_go
@@ -150,7 +153,7 @@ class TrajectoryBuffer:
             storage.append(
                 {
                     "observations": trajectory.observations,
-                    "actions": np.clip(trajectory.actions, action_space.low, action_space.high),
+                    "actions": to_vectors(trajectory.actions, action_space),
                     "rewards": trajectory.rewards,
                     "returns_to_go": to_go,
                 }
@@ -349,7 +352,8 @@ class TrajectoryBuffer:
         steps = {
             name: getattr(self, name).index_select(0, rows).cpu().numpy() for name in ("observations", "actions", "rewards")
         }
-        space = {"action_low": self.action_space.low, "action_high": self.action_space.high}
+        steps["actions"] = from_vectors(steps["actions"], self.action_space)
+        space = dict(zip(("action_low", "action_high"), bounds_of(self.action_space), strict=True))
         named = {} if self.env_id is None else {"env_id": np.array(self.env_id)}
         with replacing(path) as beside, open(beside, "wb") as file:
             np.savez(file, **steps, **ended, episode_ends=stops, **space, **named)

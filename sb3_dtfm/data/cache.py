@@ -18,6 +18,7 @@ import torch as th
 from filelock import FileLock
 from gymnasium import spaces
 
+from sb3_dtfm.actions import bounds_of, choices_between, vector_space
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.episodes import EpisodeTable
 from sb3_dtfm.data.storage import STEP_ARRAYS, WRITE_BUFFER, FileStorage, MappedSteps
@@ -27,7 +28,7 @@ from sb3_dtfm.data.trajectories import DatasetError, ScoreReference
 FORMAT = 3
 DESCRIPTION = "cache.json"
 EPISODES = "episodes.npz"
-BOXES = ("observation_space", "action_space")
+SPACES = ("observation_space", "action_space")
 # Files of more bytes than this are checked in the background; reading takes about a second for 2**30.
 LARGE = 2**26
 # What numpy raises for a file that is missing, empty, cut off, or of another kind.
@@ -154,13 +155,15 @@ def _build(folder: Path, fingerprint: Fingerprint, read: Callable[[FileStorage],
 
 def _write_episodes(folder: Path, buffer: TrajectoryBuffer) -> None:
     """The arrays that are small: one row per episode, and the bounds of the spaces."""
-    bounds = {f"{name}_{bound}": getattr(getattr(buffer, name), bound) for name in BOXES for bound in ("low", "high")}
+    bounds = {}
+    for name in SPACES:
+        bounds[f"{name}_low"], bounds[f"{name}_high"] = bounds_of(getattr(buffer, name))
     np.savez(folder / EPISODES, **buffer.episodes._asdict(), **bounds)
 
 
-def _stored_box(arrays: Mapping[str, np.ndarray], name: str) -> spaces.Box:
+def _stored_space(arrays: Mapping[str, np.ndarray], name: str) -> Any:
     low, high = arrays[f"{name}_low"], arrays[f"{name}_high"]
-    return spaces.Box(low, high, dtype=low.dtype.type)
+    return spaces.Box(low, high, dtype=low.dtype.type) if low.ndim else choices_between(low, high)
 
 
 def _read_description(folder: Path) -> dict[str, Any]:
@@ -191,10 +194,13 @@ def open_cache(folder: Path) -> TrajectoryBuffer:
     try:
         with np.load(folder / EPISODES) as arrays:
             episodes = EpisodeTable(*(arrays[name] for name in EpisodeTable._fields))
-            observation_space, action_space = (_stored_box(arrays, name) for name in BOXES)
+            observation_space, action_space = (_stored_space(arrays, name) for name in SPACES)
     except READ_ERRORS as error:
         raise _damaged(folder, EPISODES, error) from error
-    shapes: dict[str, tuple[int, ...]] = {"observations": observation_space.shape, "actions": action_space.shape}
+    shapes: dict[str, tuple[int, ...]] = {
+        "observations": observation_space.shape,
+        "actions": vector_space(action_space).shape,
+    }
     n_steps = int(description["n_steps"])
     reference = description["score_reference"]
     maps = {name: _checked_map(folder, name, (n_steps, *shapes.get(name, ()))) for name in STEP_ARRAYS}

@@ -12,10 +12,11 @@ import h5py
 import numpy as np
 from gymnasium import spaces
 
+from sb3_dtfm.actions import ActionSpace, bounds_of, choices_between
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, existing_file
 from sb3_dtfm.data.hdf5 import read_hdf5
-from sb3_dtfm.data.observations import as_vectors
+from sb3_dtfm.data.observations import as_vectors, check_no_images
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_flags, check_real, check_size, naming
 
@@ -74,7 +75,7 @@ def json_options(options: dict[str, Any]) -> dict[str, Any]:
     options = dict(options)
     space = options.pop("action_space", None)
     if options.get("action_bounds") is None and space is not None:
-        options["action_bounds"] = (space.low, space.high)
+        options["action_bounds"] = bounds_of(space)
     if options.get("action_bounds") is not None:
         options["action_bounds"] = [np.asarray(bound).tolist() for bound in options["action_bounds"]]
     return options
@@ -85,23 +86,24 @@ def load_flat(
     observation_keys: Sequence[str] | None = None,
     action_bounds: Sequence[Any] | None = None,
     clip_actions: bool = False,
-    action_space: spaces.Box | None = None,
+    action_space: ActionSpace | None = None,
     on_invalid: str = "raise",
     storage: FileStorage | None = None,
 ) -> TrajectoryBuffer:
     """
     Episodes one after the other in flat arrays of N steps: as `numpy.savez` writes them, in D4RL's hdf5 files, or in memory.
 
-    Read are `observations` (N, O), `actions` (N, A) and `rewards` (N,), or what others call them (`obs`, `state`, `action`,
-    `reward`). Episodes end where `episode_ends` says (E,), counting steps from the start of the file, or after
-    `episode_lengths` (E,) each, or at the steps of `terminals` or `timeouts` (N,). Without rewards every episode counts as a
-    success: a reward of 1 at its last step. Nothing in a file is ever executed: arrays of Python objects are refused. The
-    arrays are read into memory, also to write a cache of them.
+    Read are `observations` (N, O), `actions` (N, A), or whole numbers (N,) of a Discrete space, and `rewards` (N,), or what
+    others call them (`obs`, `state`, `action`, `reward`). Episodes end where `episode_ends` says (E,), counting steps from
+    the start of the file, or after `episode_lengths` (E,) each, or at the steps of `terminals` or `timeouts` (N,). Without
+    rewards every episode counts as a success: a reward of 1 at its last step. Nothing in a file is ever executed: arrays of
+    Python objects are refused. The arrays are read into memory, also to write a cache of them.
 
     :param dataset: path of the file, or arrays by name
     :param observation_keys: which arrays make up the observation, in this order, each (N, ...)
     :param action_bounds: smallest and largest action that the environment accepts, numbers or (A,) each; where they are not
-        given, a file's own `action_low` and `action_high`, or those of `action_space`, or -1 and 1
+        given, a file's own `action_low` and `action_high`, or those of `action_space`, or -1 and 1. Of Discrete actions the
+        first and the last one
     :param clip_actions: bring actions outside of them to the nearest bound, however far, instead of refusing them
     :param action_space: the environment's
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
@@ -245,17 +247,16 @@ def _read(
     observation_keys: Sequence[str] | None,
     action_bounds: Sequence[Any] | None,
     clip_actions: bool,
-    action_space: spaces.Box | None,
+    action_space: ActionSpace | None,
     on_invalid: str,
     storage: FileStorage | None,
 ) -> TrajectoryBuffer:
     source = arrays.source
     actions = arrays.read(ACTIONS)
-    if actions.ndim != 2 or not len(actions):
-        raise DatasetError(f"{source}: actions have shape {actions.shape}; (N, A) is expected, for at least one step.")
+    check_shape(actions, action_space, source)
     n_steps = len(actions)
     keys = observation_keys or (arrays.name(OBSERVATIONS),)
-    observations = [arrays.read((key,), n_steps).reshape(n_steps, -1) for key in keys]
+    observations = [_observations(arrays, key, n_steps) for key in keys]
     observation = observations[0] if len(observations) == 1 else np.concatenate(observations, axis=1)
     terminated, truncated = (_flags(arrays, names, n_steps) for names in (TERMINATIONS, TRUNCATIONS))
     stops = _stops(arrays, n_steps, terminated | truncated)
@@ -268,9 +269,8 @@ def _read(
         terminated[stops - 1] = True
     if action_bounds is None and arrays.has((LOW,)):
         action_bounds = arrays.read((LOW,)), arrays.read((HIGH,))
-    action_space = bounded_space(action_bounds, action_space, actions.shape[1], source)
-    if clip_actions:
-        actions = clipped(actions, action_space)
+    action_space = bounded_space(action_bounds, action_space, actions, source)
+    actions = fitted(actions, action_space, clip_actions)
 
     def trajectory(episode: int) -> Trajectory:
         start, stop = stops[episode - 1] if episode else 0, stops[episode]
@@ -293,6 +293,13 @@ def _read(
         on_invalid=on_invalid,
         n_stored=arrays.n_stored,
     )
+
+
+def _observations(arrays: _Arrays, key: str, n_steps: int) -> np.ndarray:
+    """(N, .), of one array."""
+    array = arrays.read((key,), n_steps)
+    check_no_images(array, f"{arrays.source}: {key}")
+    return array.reshape(n_steps, -1)
 
 
 def _flags(arrays: _Arrays, names: Sequence[str], n_steps: int) -> np.ndarray:
@@ -336,28 +343,65 @@ def _told_stops(arrays: _Arrays, name: str, n_steps: int) -> np.ndarray:
     return np.cumsum(lengths)
 
 
-def bounded_space(bounds: Sequence[Any] | None, space: spaces.Box | None, n_actions: int, source: str) -> spaces.Box:
+def check_shape(actions: np.ndarray, space: ActionSpace | None, where: str) -> None:
+    """
+    Refuse what are no actions.
+
+    :param actions: (N, A), or (N,) of Discrete ones
+    :param space: the environment's
+    :param where: whose they are, for messages
+    :raises DatasetError: another shape, or no step
+    """
+    choices = actions.ndim == 1 and (isinstance(space, spaces.Discrete) or actions.dtype.kind in "iub")
+    if not (actions.ndim == 2 or choices) or not len(actions):
+        raise DatasetError(
+            f"{where}: actions have shape {actions.shape}; (N, A) is expected, or whole numbers (N,) for a Discrete action "
+            "space, for at least one step."
+        )
+
+
+def bounded_space(bounds: Sequence[Any] | None, space: ActionSpace | None, actions: np.ndarray, source: str) -> ActionSpace:
     """
     The action space of data that hold numbers alone.
 
     :param bounds: smallest and largest action, numbers or (A,) each
     :param space: the environment's, where `bounds` are not given
-    :param n_actions: A
+    :param actions: as :func:`check_shape` lets them pass
     :param source: whose actions they are, for messages
-    :return: from -1 to 1 where neither is given
-    :raises DatasetError: `bounds` are something else
+    :return: where neither is given, from -1 to 1
+    :raises DatasetError: `bounds` are something else, or nobody says how many Discrete actions there are
     """
-    if bounds is None and space is not None and space.shape == (n_actions,):
+    if bounds is None and space is not None and (isinstance(space, spaces.Discrete) or space.shape == actions.shape[1:]):
         return space
-    try:
-        low, high = (np.broadcast_to(np.asarray(bound, np.float32), (n_actions,)) for bound in bounds or (-1.0, 1.0))
-        return spaces.Box(low, high, dtype=np.float32)
-    except (TypeError, ValueError) as error:
+    n_actions = actions.shape[1:]
+    if not n_actions and bounds is None:
         raise DatasetError(
-            f"{source}: action_bounds is {bounds!r}; smallest and largest action are expected, numbers or {n_actions} each."
+            f"{source}: actions are whole numbers, one a step, and nobody says how many there are: give an environment with "
+            "a Discrete action space, or action_bounds=(first, last)."
+        )
+    try:
+        if not n_actions:
+            first, last = bounds or ()
+            return choices_between(first, last)
+        low, high = (np.broadcast_to(np.asarray(bound, np.float32), n_actions) for bound in bounds or (-1.0, 1.0))
+        return spaces.Box(low, high, dtype=np.float32)
+    except (TypeError, ValueError, OverflowError) as error:
+        expected = f"numbers or {n_actions[0]} each" if n_actions else "whole numbers"
+        raise DatasetError(
+            f"{source}: action_bounds is {bounds!r}; smallest and largest action are expected, {expected}."
         ) from error
 
 
-def clipped(actions: np.ndarray, space: spaces.Box) -> np.ndarray:
-    """Actions (T, A) inside of the space; what is not finite stays, to be refused."""
-    return np.where(np.isfinite(actions), np.clip(actions, space.low, space.high), actions)
+def fitted(actions: np.ndarray, space: ActionSpace, clip: bool) -> np.ndarray:
+    """
+    Actions in the shape of their space, where they can be.
+
+    :param actions: (T, A), (T,), or (T, 1) of Discrete ones
+    :param space: what they are to be learned as
+    :param clip: bring them into it; what is not finite stays, to be refused
+    """
+    if isinstance(space, spaces.Discrete) and actions.shape[1:] == (1,):
+        actions = actions[:, 0]
+    if not clip or actions.shape[1:] != space.shape:
+        return actions
+    return np.where(np.isfinite(actions), np.clip(actions, *bounds_of(space)), actions)

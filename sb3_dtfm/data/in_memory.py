@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
+from sb3_dtfm.actions import ActionSpace
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.flat import (
     ACTIONS,
@@ -19,7 +20,8 @@ from sb3_dtfm.data.flat import (
     TERMINATIONS,
     TRUNCATIONS,
     bounded_space,
-    clipped,
+    check_shape,
+    fitted,
 )
 from sb3_dtfm.data.observations import as_vectors, flatten_observations
 from sb3_dtfm.data.storage import FileStorage
@@ -39,15 +41,16 @@ def load_episodes(
     episodes: Sequence[Any],
     action_bounds: Sequence[Any] | None = None,
     clip_actions: bool = False,
-    action_space: spaces.Box | None = None,
+    action_space: ActionSpace | None = None,
     on_invalid: str = "raise",
     storage: FileStorage | None = None,
 ) -> TrajectoryBuffer:
     """
     Episodes one by one, each of which may be
 
-    - a dictionary of `observations` (T, O) or (T + 1, O), `actions` (T, A), `rewards` (T,), and `terminated` and
-      `truncated`, for the episode or for each step, or what others call them; observations may be dictionaries, too
+    - a dictionary of `observations` (T, O) or (T + 1, O), `actions` (T, A), or (T,) of a Discrete space, `rewards` (T,), and
+      `terminated` and `truncated`, for the episode or for each step, or what others call them; observations may be
+      dictionaries, too
     - a :class:`~sb3_dtfm.data.Trajectory`
     - a trajectory of the package imitation: `obs`, `acts`, `terminal`, `rews` where it has some
     - a list of steps `(observation, action, reward, terminated, truncated)`, as they come from a Gymnasium environment:
@@ -65,13 +68,11 @@ def load_episodes(
         actions out of bounds; names the episode and the step
     """
     source = "episodes"
-    space = bounded_space(action_bounds, action_space, _n_actions(episodes, source, on_invalid), source)
+    space = bounded_space(action_bounds, action_space, _some_actions(episodes, action_space, source, on_invalid), source)
 
     def trajectory(number: int) -> Trajectory:
         found = _trajectory(episodes[number], number, source)
-        if clip_actions and found.actions.shape[1:] == space.shape:
-            return replace(found, actions=clipped(found.actions, space))
-        return found
+        return replace(found, actions=fitted(found.actions, space, clip_actions))
 
     numbers = range(len(episodes))
     return TrajectoryBuffer.from_trajectories(
@@ -79,14 +80,13 @@ def load_episodes(
     )
 
 
-def _n_actions(episodes: Sequence[Any], source: str, on_invalid: str) -> int:
-    """A, of the first episode, or the first that can be kept."""
+def _some_actions(episodes: Sequence[Any], action_space: ActionSpace | None, source: str, on_invalid: str) -> np.ndarray:
+    """The actions of the first episode, or the first that can be kept."""
     for number, episode in enumerate(episodes):
         try:
-            shape = _trajectory(episode, number, source).actions.shape
-            if len(shape) != 2:
-                raise DatasetError(f"{source}, episode {number}: actions have shape {shape}; (T, A) is expected.")
-            return int(shape[1])
+            actions = _trajectory(episode, number, source).actions
+            check_shape(actions, action_space, f"{source}, episode {number}")
+            return actions
         except DatasetError:
             if on_invalid != "drop" or number == len(episodes) - 1:
                 raise
@@ -171,7 +171,7 @@ def load_replay_buffer(
     """
     The episodes of a replay buffer, such as `model.replay_buffer` of an SB3 model, environment by environment.
 
-    SB3's algorithms store actions scaled to [-1, 1]; they are brought back into the range of the buffer's action space.
+    SB3's algorithms store actions of a Box scaled to [-1, 1]; they are brought back into the buffer's action space.
     Observations and rewards are there as the environment gave them, `VecNormalize` or not. An episode at whose end
     `TimeLimit.truncated` was said is truncated. The last one of each environment stops where the buffer does; of a full
     buffer, the first one of each environment is left out, since its beginning has been written over.
@@ -214,10 +214,12 @@ def load_replay_buffer(
             return np.asarray(observations[steps, env])
 
         columns = flatten_observations(read, ("observations",), observation_space, f"{source}, {name}")
-        scaled = replay_buffer.actions[steps, env].astype(np.float64)
+        actions = replay_buffer.actions[steps, env]
+        if isinstance(space, spaces.Box):
+            actions = space.low + 0.5 * (actions.astype(np.float64) + 1.0) * (space.high - space.low)
         return Trajectory(
             observations=np.concatenate(columns, axis=1),
-            actions=space.low + 0.5 * (scaled + 1.0) * (space.high - space.low),
+            actions=fitted(actions, space, clip=False),
             rewards=replay_buffer.rewards[steps, env],
             terminated=done and not late,
             truncated=done and late,

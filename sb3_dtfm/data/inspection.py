@@ -4,7 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 
+from sb3_dtfm.actions import bounds_of, vector_space
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 
 # Below this share of the range of actions that the data use, learning is in a corner of it.
@@ -32,8 +34,8 @@ class Inspection(NamedTuple):
     What was found.
 
     :param observations: of O dimensions
-    :param actions: of A dimensions, in the environment's range
-    :param at_bounds: share of all actions' entries at a bound of the action space
+    :param actions: of A dimensions, in the environment's range; of a Discrete space's n actions, whose mean is a share
+    :param at_bounds: share of all actions' entries at a bound of the action space, of no meaning for Discrete ones
     :param target_return: to ask for: the mean return of the best tenth of the episodes, four digits
     :param remarks: sentences about what may be wrong
     """
@@ -55,7 +57,7 @@ def inspect_buffer(buffer: TrajectoryBuffer) -> Inspection:
     observations = _range(buffer.observations.index_select(0, rows))
     values = buffer.actions.index_select(0, rows)
     actions = _range(values)
-    low, high = (th.from_numpy(bound).to(values) for bound in (buffer.action_space.low, buffer.action_space.high))
+    low, high = (th.from_numpy(bound).to(values) for bound in bounds_of(vector_space(buffer.action_space)))
     margin = AT_BOUND * (high - low)
     at_bounds = float(((values <= low + margin) | (values >= high - margin)).float().mean())
     best = buffer.best(best_share=BEST_SHARE).episode_returns.mean()
@@ -111,6 +113,9 @@ def _of_observations(found: Range) -> list[str]:
 
 def _of_actions(buffer: TrajectoryBuffer, found: Range, at_bounds: float) -> list[str]:
     space, remarks = buffer.action_space, []
+    if isinstance(space, spaces.Discrete):
+        never = int(space.start) + np.flatnonzero(found.high == 0.0)
+        return [f"Never chosen: {_listed(never)}."] if len(never) else []
     used = (found.high - found.low) / (space.high - space.low)
     still, narrow = np.flatnonzero(used == 0), np.flatnonzero((used > 0) & (used < NARROW))
     if len(still):
@@ -124,8 +129,11 @@ def _of_actions(buffer: TrajectoryBuffer, found: Range, at_bounds: float) -> lis
 
 
 def _dimensions(indices: np.ndarray) -> str:
-    shown = ", ".join(map(str, indices[:8])) + (" ..." if len(indices) > 8 else "")
-    return f"dimension{'s' if len(indices) > 1 else ''} {shown}"
+    return f"dimension{'s' if len(indices) > 1 else ''} {_listed(indices)}"
+
+
+def _listed(numbers: np.ndarray) -> str:
+    return ", ".join(map(str, numbers[:8])) + (" ..." if len(numbers) > 8 else "")
 
 
 def _count(n: int, what: str) -> str:

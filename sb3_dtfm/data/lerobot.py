@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 
+from sb3_dtfm.actions import ActionSpace
 from sb3_dtfm.data.arrow import import_pyarrow
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint
-from sb3_dtfm.data.flat import bounded_space, clipped, json_options
+from sb3_dtfm.data.flat import bounded_space, fitted, json_options
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_real, check_size, naming
 
@@ -45,7 +45,7 @@ def load_lerobot(
     observation_keys: Sequence[str] | None = None,
     action_bounds: Sequence[Any] | None = None,
     clip_actions: bool = False,
-    action_space: spaces.Box | None = None,
+    action_space: ActionSpace | None = None,
     on_invalid: str = "raise",
     storage: FileStorage | None = None,
 ) -> TrajectoryBuffer:
@@ -93,9 +93,9 @@ def load_lerobot(
     actions = columns[ACTION]
     if action_bounds is None and action_space is None:
         action_bounds = _recorded(actions)
-    space = bounded_space(action_bounds, action_space, actions.shape[1], source)
+    space = bounded_space(action_bounds, action_space, actions, source)
     observations = np.concatenate([columns[key] for key in keys], axis=1)
-    actions = clipped(actions, space) if clip_actions else actions
+    actions = fitted(actions, space, clip_actions)
 
     def trajectory(number: int, start: int, stop: int) -> Trajectory:
         steps = slice(start, stop)

@@ -28,6 +28,7 @@ def as_vectors(observations: Any, where: str) -> np.ndarray:
         check_real(array.dtype, where)
         if array.ndim == 0 or array.size == 0:
             raise DatasetError(f"{where} has shape {array.shape}; one entry a step is expected, for at least one step.")
+        check_no_images(array, where)
         return array.reshape(len(array), -1)
     if not observations:
         raise DatasetError(f"{where} is an empty dictionary.")
@@ -36,6 +37,18 @@ def as_vectors(observations: Any, where: str) -> np.ndarray:
     if len(set(lengths.values())) > 1:
         raise DatasetError(f"{where} has entries of different lengths: {lengths}.")
     return np.concatenate(list(parts.values()), axis=1)
+
+
+def check_no_images(array: np.ndarray, where: str) -> None:
+    """
+    Refuse what the wrapper refuses in an environment.
+
+    :param array: (T, ...)
+    :param where: whose it is, for messages
+    :raises DatasetError: bytes with more than one axis a step
+    """
+    if array.dtype == np.uint8 and array.ndim > 2:
+        raise DatasetError(f"{where} has shape {array.shape} and holds images; only vectors of numbers can be used.")
 
 
 def flatten_observations(read: ReadArray, path: tuple[str | int, ...], space: spaces.Space, where: str) -> list[np.ndarray]:

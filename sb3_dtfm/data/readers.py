@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-from gymnasium import spaces
 from minari import MinariDataset
 from stable_baselines3.common.buffers import ReplayBuffer
 
+from sb3_dtfm.actions import ActionSpace
 from sb3_dtfm.arguments import with_nearest
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, load_cached
@@ -57,7 +57,7 @@ def _is_one_of_several(dataset: Any) -> bool:
     return isinstance(dataset, str | os.PathLike | MinariDataset | ReplayBuffer | TrajectoryBuffer)
 
 
-def load_several(datasets: Sequence[Any], action_space: spaces.Box | None = None) -> TrajectoryBuffer:
+def load_several(datasets: Sequence[Any], action_space: ActionSpace | None = None) -> TrajectoryBuffer:
     """
     Several datasets of one task as one, in memory.
 
@@ -95,7 +95,7 @@ def load_dataset(
     dataset: Dataset,
     cache_dir: str | os.PathLike[str] | None = None,
     env_id: str | None = None,
-    action_space: spaces.Box | None = None,
+    action_space: ActionSpace | None = None,
     min_return: float | None = None,
     best_share: float | None = None,
     **kwargs: Any,

@@ -8,8 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
+from sb3_dtfm.actions import ActionSpace
+
 # Recorded float64 actions may pass a float32 bound by a rounding error; beyond this share of the range they are wrong.
 ACTION_TOLERANCE = 1e-4
+# Choices of a Discrete action space at most: each takes a number in every step.
+MOST_CHOICES = 2**16
 # The kinds of NumPy's types that are real numbers: float, int, unsigned, bool.
 REAL = "fiub"
 # An array may take this many times the bytes that are stored of it, and this many bytes more: far less than a file of
@@ -94,7 +98,7 @@ class Trajectory:
     One recorded episode of T steps.
 
     :param observations: (T, O), the observation each action was chosen on
-    :param actions: (T, A), in the environment's own range
+    :param actions: (T, A), in the environment's own range; (T,) where it has a Discrete action space
     :param rewards: (T,), environment reward units
     :param terminated: the last step reached a terminal state
     :param truncated: the last step hit a time limit; neither flag set means that the recording stopped mid-episode
@@ -138,16 +142,21 @@ def returns_to_go(rewards: np.ndarray) -> np.ndarray:
     return np.subtract.accumulate(np.concatenate([[rewards.sum()], rewards[:-1]]))
 
 
-def check_action_space(space: spaces.Space, source: str) -> spaces.Box:
+def check_action_space(space: spaces.Space, source: str) -> ActionSpace:
     """
-    The action space, if actions from it can be learnt: scaled to [-1, 1] and back in float32.
+    The action space, if actions from it can be learnt: scaled to [-1, 1] and back in float32, or one of several choices.
 
     :param space: of a dataset or an environment
     :param source: whose it is, for messages
-    :raises DatasetError: not a Box of floats of shape (A,), or a dimension without bounds or width
+    :raises DatasetError: neither a Box of floats of shape (A,) nor Discrete, or a dimension without bounds or width
     """
     problem = f"{source}: the action space is {space}"
-    accepted = "only a bounded Box of floats of shape (A,), low < high in each dimension, can be learnt"
+    accepted = (
+        "only a bounded Box of floats of shape (A,), low < high in each dimension, "
+        f"or a Discrete of 2 to {MOST_CHOICES:,} actions, can be learnt"
+    )
+    if isinstance(space, spaces.Discrete) and 2 <= space.n <= MOST_CHOICES:
+        return space
     is_vector = len(space.shape or ()) == 1 and space.shape != (0,)
     if not isinstance(space, spaces.Box) or not np.issubdtype(space.dtype, np.floating) or not is_vector:
         raise DatasetError(f"{problem}; {accepted}.")
@@ -162,7 +171,7 @@ def check_action_space(space: spaces.Space, source: str) -> spaces.Box:
 
 
 def check_trajectory(
-    trajectory: Trajectory, observation_space: spaces.Box, action_space: spaces.Box, source: str
+    trajectory: Trajectory, observation_space: spaces.Box, action_space: ActionSpace, source: str
 ) -> np.ndarray:
     """
     Refuse an episode that training must not see.
@@ -180,7 +189,7 @@ def check_trajectory(
         raise DatasetError(f"{where}: holds no step; at least one is needed.")
     expected = {
         "observations": (n_steps, *observation_space.shape),
-        "actions": (n_steps, *action_space.shape),
+        "actions": (n_steps, *(action_space.shape or ())),
         "rewards": (n_steps,),
     }
     for name, shape in expected.items():
@@ -189,18 +198,33 @@ def check_trajectory(
         if np.shape(array) != shape:
             raise DatasetError(f"{where}: {name} have shape {np.shape(array)}, expected {shape}.")
         check_finite(array, name, where)
-    slack = ACTION_TOLERANCE * (action_space.high - action_space.low)
-    low, high = action_space.low - slack, action_space.high + slack
-    if not ((trajectory.actions >= low).all() and (trajectory.actions <= high).all()):
-        outside = (trajectory.actions < low) | (trajectory.actions > high)
-        step, dimension = (int(i) for i in np.argwhere(outside)[0])
-        raise DatasetError(
-            f"{where}, step {step}: action {trajectory.actions[step, dimension]:g} in dimension {dimension} lies outside of "
-            f"the action space [{action_space.low[dimension]:g}, {action_space.high[dimension]:g}]."
-        )
+    if isinstance(action_space, spaces.Discrete):
+        _check_choices(trajectory.actions, action_space, where)
+    else:
+        _check_inside(trajectory.actions, action_space, where)
     to_go = returns_to_go(trajectory.rewards)
     check_finite(to_go, "returns-to-go, sums of rewards,", where)
     return to_go
+
+
+def _check_inside(actions: np.ndarray, space: spaces.Box, where: str) -> None:
+    slack = ACTION_TOLERANCE * (space.high - space.low)
+    low, high = space.low - slack, space.high + slack
+    if not ((actions >= low).all() and (actions <= high).all()):
+        outside = (actions < low) | (actions > high)
+        step, dimension = (int(i) for i in np.argwhere(outside)[0])
+        raise DatasetError(
+            f"{where}, step {step}: action {actions[step, dimension]:g} in dimension {dimension} lies outside of "
+            f"the action space [{space.low[dimension]:g}, {space.high[dimension]:g}]."
+        )
+
+
+def _check_choices(actions: np.ndarray, space: spaces.Discrete, where: str) -> None:
+    first, last = int(space.start), int(space.start) + int(space.n) - 1
+    unfit = (actions < first) | (actions > last) | (actions % 1 != 0)
+    if unfit.any():
+        step = int(np.argmax(unfit))
+        raise DatasetError(f"{where}, step {step}: action {actions[step]:g} is no whole number from {first} to {last}.")
 
 
 def check_finite(array: np.ndarray, name: str, where: str) -> None:

@@ -7,6 +7,9 @@ from typing import Any, ClassVar
 import torch as th
 from torch import nn
 
+# Rows of the table that deterministic acting takes its noise from.
+NOISE_ROWS = 1024
+
 
 class ActionHead(nn.Module, ABC):
     """
@@ -18,11 +21,13 @@ class ActionHead(nn.Module, ABC):
     :param action_dim: A
 
     :cvar algorithm: name of the algorithm that trunk and head make together, for example "DTFM"
+    :cvar discrete: the head that takes its place, and its options, where the action space is Discrete; None refuses it
     :cvar acting_choices: options that may be changed after training, attributes of the head; `check_acting` checks them
     :ivar noise_dim: numbers of standard normal noise that an action starts from, 0 if none
     """
 
     algorithm: ClassVar[str]
+    discrete: ClassVar[type["ActionHead"] | None] = None
     acting_choices: ClassVar[tuple[str, ...]] = ()
     noise_dim: int = 0
 
@@ -42,6 +47,15 @@ class ActionHead(nn.Module, ABC):
         :raises ValueError: names the choice, what was given and what is accepted
         """
         return choices
+
+    def deterministic_noise(self, generator: th.Generator) -> th.Tensor:
+        """
+        What deterministic acting starts from, saved with the weights: rows that it takes one after the other.
+
+        :param generator: for what is drawn
+        :return: (R, noise_dim)
+        """
+        return th.randn(NOISE_ROWS, self.noise_dim, generator=generator, device=generator.device)
 
     def draw_noise(self, actions: th.Tensor, generator: th.Generator) -> tuple[th.Tensor, ...]:
         """

@@ -3,6 +3,7 @@
 import torch as th
 
 from sb3_dtfm.heads.base import ActionHead, masked_mean
+from sb3_dtfm.heads.categorical import CategoricalHead
 from sb3_dtfm.networks.cpu import Linear
 
 
@@ -10,6 +11,7 @@ class RegressionHead(ActionHead):
     """Decision Transformer (Chen et al., 2021): a linear map of the hidden state, bounded by tanh, by mean squared error."""
 
     algorithm = "DT"
+    discrete = CategoricalHead
 
     def __init__(self, embed_dim: int, action_dim: int) -> None:
         super().__init__(embed_dim, action_dim)

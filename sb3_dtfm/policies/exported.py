@@ -4,6 +4,7 @@ import copy
 from typing import Any
 
 import torch as th
+from gymnasium import spaces
 from torch import nn
 from torch.nn import functional as F
 
@@ -18,6 +19,8 @@ class ExportedPolicy(nn.Module):
 
     Whoever calls it keeps the windows: shifts them by a step, puts in the newest one, and when the action is carried out
     that, too. A row begins anew when its mask is cleared; what is behind the mask may be any finite number.
+
+    Actions of a Discrete space are vectors here: 1 for the choice, 0 for the others.
 
     :param policy: stays as it is; what acts of it is copied to the CPU
     """
@@ -36,8 +39,9 @@ class ExportedPolicy(nn.Module):
             "chunk_size": policy.chunk_size,
             "observation_dim": policy.observation_dim,
             "action_dim": policy.action_dim,
-            "action_low": policy.action_space.low.tolist(),
-            "action_high": policy.action_space.high.tolist(),
+            "action_low": policy.vector_space.low.tolist(),
+            "action_high": policy.vector_space.high.tolist(),
+            "first_action": None if isinstance(policy.action_space, spaces.Box) else int(policy.action_space.start),
             "tokens_per_step": self.network.trunk.tokens_per_step,
             "noise_dim": self.network.head.noise_dim,
             **policy.acting_settings(),

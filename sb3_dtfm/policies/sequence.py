@@ -13,6 +13,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
+from sb3_dtfm.actions import ActionSpace, from_vectors, vector_space
 from sb3_dtfm.arguments import (
     BOOLEAN,
     COUNT,
@@ -31,8 +32,6 @@ from sb3_dtfm.policies.memory import RememberedContext
 from sb3_dtfm.policies.normalization import Normalization
 from sb3_dtfm.windows import Context, Windows, check_context, empty_context, push, restarts, unpack_observation, with_plan
 
-# Rows of the table that deterministic acting takes its noise from.
-NOISE_ROWS = 1024
 ACCEPTED: dict[str, Rule] = {
     "context_length": COUNT,
     "max_timestep": COUNT,
@@ -73,7 +72,8 @@ class SequencePolicy(BasePolicy):
     give all of them the same luck.
 
     :param observation_space: Dict of `observation` (O,), `return_to_go` (1,) and `timestep` (1,)
-    :param action_space: bounded Box (A,)
+    :param action_space: bounded Box (A,); or Discrete, whose actions are vectors for all but `predict`, see
+        :mod:`~sb3_dtfm.actions`
     :param lr_schedule: learning rate over the progress remaining, from 1 to 0
     :param context_length: K, steps the policy sees
     :param max_timestep: time steps with an embedding of their own
@@ -100,18 +100,18 @@ class SequencePolicy(BasePolicy):
         faster, and equal until the window slides (see :meth:`SequenceTrunk.extend`)
     :param seed: seed of the noise that acting starts from
     :param head_options: options of the head, see its class
-    :raises ValueError: an argument out of range or unknown, by name
+    :raises ValueError: an argument out of range or unknown, by name, or an action space that the head does not learn
     """
 
     head_class: ClassVar[type[ActionHead]]
     observation_space: spaces.Dict
-    action_space: spaces.Box
+    action_space: ActionSpace
     noise_table: th.Tensor
 
     def __init__(
         self,
         observation_space: spaces.Dict,
-        action_space: spaces.Box,
+        action_space: ActionSpace,
         lr_schedule: Schedule,
         context_length: int = 20,
         max_timestep: int = 1000,
@@ -139,25 +139,31 @@ class SequencePolicy(BasePolicy):
         if n_action_steps is None:
             arguments["n_action_steps"] = (arguments["chunk_size"] + 1) // 2
         self._check_names(head_options)
+        head_class = self.head_for(action_space)
         self.context_length = context_length
         self.weight_decay = arguments["weight_decay"]
         self.kv_cache = arguments["kv_cache"]
         self.chunk_size = arguments["chunk_size"]
+        if self.chunk_size > 1 and not isinstance(action_space, spaces.Box):
+            raise ValueError(
+                f"chunk_size must be 1 for {action_space}, whose actions are chosen one by one; got {chunk_size}."
+            )
         arguments.update(check_arguments(arguments, self._acting_rules()))
         self.n_action_steps = arguments["n_action_steps"]
         self._constructor_arguments = {**arguments, **self.head_class.options(), **head_options}
         self.seed = seed
         self.observation_dim = int(observation_space["observation"].shape[0])  # type: ignore[index]
-        self.action_dim = int(action_space.shape[0])
-        units = (self.observation_dim, action_space, max_timestep)
+        self.vector_space = vector_space(action_space)
+        self.action_dim = int(self.vector_space.shape[0])
+        units = (self.observation_dim, self.vector_space, max_timestep)
         self.normalization = Normalization(*units, clip_return_to_go, average_return_to_go, calm_units)
         sizes = (self.observation_dim, self.action_dim, max_timestep, embed_dim, n_layers, n_heads)
         trunk = SequenceTrunk(*sizes, dropout, timestep_embedding, tokens_per_step, film_return_to_go)
-        self.network = SequenceNetwork(trunk, self.head_class(embed_dim, self.chunk_size * self.action_dim, **head_options))
+        self.network = SequenceNetwork(trunk, head_class(embed_dim, self.chunk_size * self.action_dim, **head_options))
         self.ema_network = copy.deepcopy(self.network).requires_grad_(False) if ema else None
         self.optimizer = self._make_optimizer(lr_schedule(1.0))
         generator = th.Generator().manual_seed(0 if seed is None else seed)
-        self.register_buffer("noise_table", standard_normal(NOISE_ROWS, self.network.head.noise_dim, generator))
+        self.register_buffer("noise_table", self.network.head.deterministic_noise(generator))
         self._acting_generator: th.Generator | None = None
         self._remembered = RememberedContext()
 
@@ -173,6 +179,20 @@ class SequencePolicy(BasePolicy):
             accepted = sorted(cls.parameter_names())
             named = with_nearest(unknown, accepted)
             raise ValueError(f"policy_kwargs: {named} is unknown to {cls.__name__}; accepted are {', '.join(accepted)}.")
+
+    @classmethod
+    def head_for(cls, action_space: ActionSpace) -> type[ActionHead]:
+        """
+        The head that learns actions of a space.
+
+        :raises ValueError: there is none
+        """
+        if isinstance(action_space, spaces.Box):
+            return cls.head_class
+        if cls.head_class.discrete is None:
+            name = cls.head_class.algorithm
+            raise ValueError(f"{name} learns vectors of numbers and not {action_space}; use DT for Discrete actions.")
+        return cls.head_class.discrete
 
     @property
     def acting_network(self) -> SequenceNetwork:
@@ -298,7 +318,7 @@ class SequencePolicy(BasePolicy):
         :param state: what the last call returned
         :param episode_start: (B,) bool, True where an environment was just reset
         :param deterministic: repeat exactly for the same model, state and inputs; otherwise draw fresh noise
-        :return: actions (A,) or (B, A) in the environment's range, and the next state
+        :return: actions (A,) or (B, A) in the environment's range, of a Discrete space () or (B,), and the next state
         :raises ValueError: not the observation of a `ReturnToGoWrapper`; a number that is not finite or a time step that is
             none, by key and row; a state of other environments, or one that holds no finite numbers
         """
@@ -333,8 +353,9 @@ class SequencePolicy(BasePolicy):
 
     def _to_environment(self, scaled_action: np.ndarray) -> np.ndarray:
         """From [-1, 1] into the action space, in its own precision."""
-        action = self.unscale_action(scaled_action).astype(self.action_space.dtype)
-        return np.clip(action, self.action_space.low, self.action_space.high)
+        low, high = self.vector_space.low, self.vector_space.high
+        action = (low + 0.5 * (scaled_action + 1.0) * (high - low)).astype(self.vector_space.dtype)
+        return from_vectors(np.clip(action, low, high), self.action_space)
 
     def _empty_context(self, n_rows: int) -> Context:
         sizes = (self.context_length, self.observation_dim, self.action_dim)
@@ -425,7 +446,7 @@ class SequencePolicy(BasePolicy):
     def _acting_noise(self, rows: np.ndarray, deterministic: bool) -> th.Tensor:
         """What the newest step's actions start from, (B, noise_dim): of these rows of the table, (B,), or fresh."""
         if deterministic or self.network.head.noise_dim == 0:
-            return self.noise_table[th.from_numpy(rows % NOISE_ROWS).to(self.noise_table.device)]
+            return self.noise_table[th.from_numpy(rows % len(self.noise_table)).to(self.noise_table.device)]
         if self._acting_generator is None:
             self.seed_noise(self.seed)
         assert self._acting_generator is not None
@@ -477,7 +498,7 @@ class SequencePolicy(BasePolicy):
             raise ValueError(f"{with_nearest(unknown, accepted)}: no way of acting; accepted are {', '.join(accepted)}.")
         settings = {**self.acting_settings(), **settings}
         own = check_arguments(settings, self._acting_rules())
-        heads = self.network.head.check_acting(**{name: settings[name] for name in self.head_class.acting_choices})
+        heads = self.network.head.check_acting(**{name: settings[name] for name in self.network.head.acting_choices})
         for name, value in own.items():
             setattr(self, name, value)
         for name, value in heads.items():

@@ -69,7 +69,7 @@ def record_agent(
     :param dataset_id: `namespace/name-vN`, in the folder that MINARI_DATASETS_PATH sets
     :param deterministic: take the agent's most likely action; otherwise sample from its policy
     :param noise: standard deviation of Gaussian noise on the actions, as a share of the action range (high - low);
-        the sum is clipped into the action space, and what is recorded is what was executed
+        the sum is clipped into the action space, and what is recorded is what was executed. Discrete actions have none
     :param n_envs: environments stepped side by side, in this process
     :param seed: seed of initial states, sampled actions and noise
     :param overwrite: replace a dataset of the same id
@@ -79,7 +79,8 @@ def record_agent(
     :param env_kwargs: arguments of ``gymnasium.make``, beside those of the agent's run
     :param device: where the agent's network runs
     :return: the dataset
-    :raises DatasetError: the id is malformed or exists, or the environment's actions are no bounded Box
+    :raises DatasetError: the id is malformed or exists, or the environment's actions are neither a bounded Box nor
+        Discrete
     :raises FileNotFoundError: no agent or normalisation file
     :raises ValueError: unknown algorithm, numbers out of range, an agent of another algorithm or that does not fit the
         environment, or one that needs VecNormalize without its statistics
@@ -97,19 +98,19 @@ def record_agent(
         check_action_space(recorders[0].action_space, env_id)
         space = check_action_space(envs[0].action_space, f"{env_id}, as {files.model.name} sees it")
         model, normalizer = load_fitting_agent(algo, files, envs[0], vec_normalize_path, device)
+        act = agent_actions(model, normalizer, deterministic)
+        act = add_noise(act, space, noise, lambda episode: np.random.default_rng([seed, 2, episode]))
         random = run_episodes(recorders, random_actions(recorders[0], seed), episode_seeds(seed, N_RANDOM_EPISODES))
         random_returns = [np.sum(episode.rewards) for episode in random]
-        how = "deterministic" if deterministic else "sampled"
+        how = f"{'deterministic' if deterministic else 'sampled'} actions"
+        how += f", Gaussian noise {noise:g} of the action range" if isinstance(space, spaces.Box) else ""
         metadata = {
             "algorithm_name": type(model).__name__,
-            "description": f"re-recorded from {files.model.name}: {n_episodes} episodes of {env_id}, {how} actions, "
-            f"Gaussian noise {noise:g} of the action range, seed {seed}.",
+            "description": f"re-recorded from {files.model.name}: {n_episodes} episodes of {env_id}, {how}, seed {seed}.",
             "ref_min_score": float(np.mean(random_returns)),
             "num_episodes_average_score": n_episodes,
         }
         set_random_seed(seed)
-        act = agent_actions(model, normalizer, deterministic)
-        act = add_noise(act, space, noise, lambda episode: np.random.default_rng([seed, 2, episode]))
         episodes = run_episodes(envs, act, episode_seeds(seed, n_episodes))
         with one_thread():
             return write_minari(dataset_id, show_progress(episodes, n_episodes, progress), recorders[0].env, metadata)
@@ -126,11 +127,16 @@ def episode_seeds(seed: int, n_episodes: int) -> list[int]:
 def random_actions(env: gym.Env, seed: int) -> ActFunction:
     """Uniform actions over the action space, the same in an episode however many run beside it."""
     space = env.action_space
-    assert isinstance(space, spaces.Box)
     generator = functools.cache(lambda episode: np.random.default_rng([seed, 1, episode]))
 
+    def draw(number: int) -> np.ndarray:
+        if isinstance(space, spaces.Discrete):
+            return np.asarray(space.start + generator(number).integers(space.n))
+        assert isinstance(space, spaces.Box)
+        return generator(number).uniform(space.low, space.high)
+
     def act(observations: Any, starts: np.ndarray, numbers: Sequence[int]) -> np.ndarray:
-        return np.stack([generator(number).uniform(space.low, space.high) for number in numbers]).astype(space.dtype)
+        return np.stack([draw(number) for number in numbers]).astype(space.dtype)
 
     return act
 

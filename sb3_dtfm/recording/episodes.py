@@ -10,9 +10,10 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_dtfm.actions import ActionSpace
 from sb3_dtfm.envs.success import reported_success
 
-# (batched observations, episode starts (n_envs,), episode numbers (n_envs,)) -> actions (n_envs, A)
+# (batched observations, episode starts (n_envs,), episode numbers (n_envs,)) -> actions (n_envs, A), or (n_envs,) of choices
 ActFunction = Callable[[Any, np.ndarray, Sequence[int]], np.ndarray]
 
 
@@ -23,7 +24,7 @@ class RecordedEpisode:
 
     :param seed: what the environment was reset with
     :param observations: T + 1 arrays, or dicts of arrays
-    :param actions: T arrays (A,)
+    :param actions: T arrays (A,), or numbers where the action space is Discrete
     :param rewards: T numbers, environment reward units
     :param terminated: ended in a terminal state
     :param truncated: ended at a time limit
@@ -68,7 +69,7 @@ class EpisodeRecorder(gym.Wrapper):
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        episode, action = self.recorded, np.asarray(action, self.action_space.dtype)
+        episode, action = self.recorded, np.asarray(action, self.action_space.dtype)[()]  # a number, not an array of none
         if self._simulator is not None:
             episode.states.append(self._simulator.state)
         episode.actions.append(action.copy())
@@ -121,16 +122,21 @@ def run_episodes(envs: Sequence[gym.Env], act: ActFunction, seeds: Sequence[int]
 
 
 def add_noise(
-    act: ActFunction, space: spaces.Box, noise: float, generator: Callable[[int], np.random.Generator]
+    act: ActFunction, space: ActionSpace, noise: float, generator: Callable[[int], np.random.Generator]
 ) -> ActFunction:
     """
-    The same actions with Gaussian noise, clipped into the action space.
+    The same actions with Gaussian noise, clipped into the action space. Of a Discrete space they stay as they are.
 
     :param act: chooses the actions
     :param space: the action space
     :param noise: standard deviation, as a share of the action range (high - low)
     :param generator: makes the source of an episode's noise from the episode's number
+    :raises ValueError: noise for Discrete actions
     """
+    if isinstance(space, spaces.Discrete):
+        if noise > 0.0:
+            raise ValueError(f"noise must be 0 for {space}, got {noise}; actions that are sampled (--stochastic) vary, too.")
+        return act
     generator = functools.cache(generator)
     scale = noise * (space.high - space.low)
 

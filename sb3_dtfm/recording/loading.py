@@ -193,7 +193,9 @@ def load_fitting_agent(
 
 
 def _shapes(space: spaces.Space) -> Any:
-    return {key: part.shape for key, part in space.spaces.items()} if isinstance(space, spaces.Dict) else space.shape
+    if isinstance(space, spaces.Dict):
+        return {key: _shapes(part) for key, part in space.spaces.items()}
+    return (space.start, space.n) if isinstance(space, spaces.Discrete) else space.shape
 
 
 def _load_vec_normalize(path: Path, env: gym.Env) -> VecNormalize:

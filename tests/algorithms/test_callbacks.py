@@ -5,12 +5,14 @@ import pytest
 import torch as th
 from stable_baselines3.common.callbacks import EvalCallback, EveryNTimesteps, StopTrainingOnRewardThreshold
 from stable_baselines3.common.monitor import Monitor
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_dtfm import DT
-from sb3_dtfm.callbacks import EvaluateAtStartAndEnd
+from sb3_dtfm import DT, DTFM
+from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, FlowFigure
 from sb3_dtfm.data import ScoreReference
 from tests.algorithms.small import make_model, record_curves
 from tests.conftest import make_env
+from tests.data.small import make_buffer
 
 SCORE = "eval/normalized_score"
 
@@ -88,3 +90,22 @@ def test_an_evaluation_before_the_first_step_changes_no_weight(cheetah_buffer):
     evaluated = make_model(DT, cheetah_buffer).learn(5, callback=[evaluation, EvaluateAtStartAndEnd([evaluation])])
     for name, tensor in plain.policy.state_dict().items():
         assert th.equal(tensor, evaluated.policy.state_dict()[name]), name
+
+
+def test_the_flow_is_drawn_into_tensorboard(tmp_path, capsys):
+    """Beside a log in the terminal, which holds no pictures."""
+    model = make_model(DTFM, make_buffer([5, 6]), tensorboard_log=str(tmp_path), verbose=1)
+    model.learn(4, callback=EveryNTimesteps(2, FlowFigure()))
+    events = EventAccumulator(str(tmp_path / "DTFM_1")).Reload()
+    assert [image.step for image in events.Images("eval/flow")] == [2, 4]
+    first, second = (image.encoded_image_string for image in events.Images("eval/flow"))
+    assert len(first) > 5000
+    assert first != second
+    assert "train/" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("algorithm", "n_numbers"), [(DT, 0), (DTFM, 6)])
+def test_what_has_no_flow_in_two_dimensions_is_not_drawn(algorithm, n_numbers, cheetah_buffer):
+    model = make_model(algorithm, cheetah_buffer)
+    with pytest.raises(ValueError, match=f"Only a flow of two numbers .* starts from {n_numbers} numbers"):
+        model.learn(1, callback=EveryNTimesteps(1, FlowFigure()))

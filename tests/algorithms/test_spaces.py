@@ -23,7 +23,8 @@ REFUSED = {
     "zero width": spaces.Box(np.array([-1.0, 0.5], np.float32), np.array([1.0, 0.5], np.float32)),
     "two axes": spaces.Box(-1.0, 1.0, (2, 3), np.float32),
     "integer": spaces.Box(0, 5, (2,), np.int64),
-    "discrete": spaces.Discrete(3),
+    "several discrete": spaces.MultiDiscrete([3, 2]),
+    "binary": spaces.MultiBinary(2),
 }
 
 
@@ -89,6 +90,47 @@ def test_actions_of_float64_are_learned_and_given_back(algorithm, make, with_env
         action, _ = loaded.predict(observation, deterministic=True)
         assert action.dtype == np.float64
         assert env.action_space.contains(action)
+        observation, *_ = env.step(action)
+
+
+OBSERVED = {
+    "integers": (spaces.Box(0, 1000, (3,), np.int64), 3),
+    "bytes": (spaces.Box(0, 255, (3,), np.uint8), 3),
+    "one of four": (spaces.Discrete(4), 4),
+    "several of some": (spaces.MultiDiscrete([2, 3]), 5),
+    "a dictionary": (spaces.Dict(place=spaces.Box(-1.0, 1.0, (2,)), room=spaces.Discrete(3)), 5),
+}
+
+
+class Seen(PointMass):
+    """A point mass of which something else is seen; what is pushed is bounded otherwise in each dimension."""
+
+    def __init__(self, observation_space: spaces.Space) -> None:
+        super().__init__(spaces.Box(np.array([-1.0, 2.0], np.float32), np.array([0.5, 7.0], np.float32)))
+        self.observation_space = observation_space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.observation_space.seed(seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        return self.observation_space.sample(), *super().step(action)[1:]
+
+
+@pytest.mark.parametrize("name", OBSERVED)
+@pytest.mark.parametrize("algorithm", [DT, DTFM])
+def test_whole_numbers_and_dictionaries_are_seen(algorithm, name):
+    """And actions stay within the bounds of their dimension."""
+    space, size = OBSERVED[name]
+    env = wrapped(Seen(space))
+    buffer = TrajectoryBuffer.from_trajectories(record(Seen(space)), env.action_space)
+    model = make_model(algorithm, buffer, env=env, learning_rate=0.1).learn(3)
+    assert model.policy.observation_dim == size
+    observation, _ = env.reset(seed=0)
+    for _ in range(5):
+        action, _ = model.predict(observation)
         observation, *_ = env.step(action)
 
 

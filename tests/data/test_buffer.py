@@ -182,7 +182,9 @@ def test_no_episode_is_refused():
 @pytest.mark.parametrize(
     ("space", "problem"),
     [
-        (spaces.Discrete(3), r"Discrete\(3\)"),
+        (spaces.Discrete(1), r"Discrete\(1\)"),
+        (spaces.Discrete(10**9), r"Discrete\(1000000000\)"),
+        (spaces.MultiDiscrete([3, 2]), r"MultiDiscrete\(\[3 2\]\)"),
         (spaces.MultiBinary(2), r"MultiBinary\(2\)"),
         (spaces.Box(-1.0, 1.0, (2, 1), np.float32), r"\(2, 1\)"),
         (spaces.Box(-1.0, 1.0, (0,), np.float32), r"\(0,\)"),

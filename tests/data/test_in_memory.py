@@ -103,7 +103,7 @@ UNFIT = {
         [{"obs": OBS, "acts": ACTS}, {"obs": OBS, "acts": ACTS[:, :1]}],
         r"episode 1: actions have shape \(3, 1\)",
     ),
-    "a flat action": ([{"obs": OBS, "acts": ACTS[:, 0]}], r"episode 0: actions have shape \(3,\); \(T, A\) is expected"),
+    "a flat action": ([{"obs": OBS, "acts": ACTS[:, 0]}], r"episode 0: actions have shape \(3,\); \(N, A\) is expected"),
     "too few observations": (
         [{"obs": OBS[:2], "acts": ACTS}],
         r"episode 0: observations have shape \(2, 3\), expected \(3, 3\)",
@@ -219,6 +219,6 @@ def test_a_replay_buffer_without_a_whole_episode():
     images = ReplayBuffer(10, spaces.Box(0, 255, (8, 8, 3), np.uint8), spaces.Box(-1, 1, (2,)), device="cpu")
     with pytest.raises(DatasetError, match=r"replay buffer: Observation space .* holds an image"):
         load_dataset(images)
-    discrete = ReplayBuffer(10, spaces.Box(-1, 1, (3,)), spaces.Discrete(3), device="cpu")
-    with pytest.raises(DatasetError, match=r"replay buffer: the action space is Discrete\(3\)"):
-        load_dataset(discrete)
+    several = ReplayBuffer(10, spaces.Box(-1, 1, (3,)), spaces.MultiBinary(3), device="cpu")
+    with pytest.raises(DatasetError, match=r"replay buffer: the action space is MultiBinary\(3\)"):
+        load_dataset(several)

@@ -266,7 +266,7 @@ def test_actions_in_float64_are_read(data_format: str):
 @pytest.mark.parametrize(
     ("space", "actions"),
     [
-        (spaces.Discrete(3), np.zeros(3, np.int64)),
+        (spaces.MultiDiscrete([3, 2]), np.zeros((3, 2), np.int64)),
         (spaces.Box(-1, 1, (2,), np.int64), np.zeros((3, 2), np.int64)),
         (spaces.Box(-np.inf, np.inf, (2,), np.float32), np.zeros((3, 2), np.float32)),
     ],

@@ -80,6 +80,22 @@ def test_a_predicted_action_stays_within_the_bounds(n_solver_steps):
     assert 0.9 < actions.abs().max() < 1.0 + 1e-6
 
 
+@pytest.mark.parametrize("prediction", PREDICTIONS)
+def test_paths_lead_from_the_noise_to_the_actions(prediction):
+    head = FlowHead(
+        embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_prediction=prediction, solver="euler", n_solver_steps=9
+    )
+    nn.init.normal_(head.vector_field.output.weight)
+    hidden, noise = th.randn(5, 4), th.randn(5, 2)
+    with th.no_grad():
+        paths = head.paths(hidden, noise, 9)
+        assert paths.shape == (10, 5, 2)
+        assert paths[0].equal(noise)
+        assert paths[-1].equal(head(hidden, noise))
+        th.testing.assert_close(paths[:2], head.paths(hidden, noise, 9)[:2])
+        assert not head.vector_field._forward_pre_hooks, "nothing stays behind"
+
+
 def test_a_head_that_predicts_actions_starts_as_decision_transformers():
     head, regression = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_prediction="action"), RegressionHead(4, 2)
     regression.linear.load_state_dict(head.regression.state_dict())

@@ -1,7 +1,9 @@
 """An exported policy: what the file gives is what `predict` gives, step by step."""
 
+import importlib.util
 import json
 import zlib
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -15,6 +17,8 @@ from sb3_dtfm.data import TrajectoryBuffer
 from sb3_dtfm.envs import ReturnToGoWrapper
 from sb3_dtfm.policies.exported import ExportedPolicy
 from tests.algorithms.small import make_model
+from tests.choices import Signs, record
+from tests.choices import make_env as make_signs
 from tests.conftest import record_random_episodes
 
 ort = pytest.importorskip("onnxruntime")
@@ -43,6 +47,7 @@ VARIANTS = {
     "dt, one token, kept keys and values": (DT, {"tokens_per_step": 1, "kv_cache": True}),
 }
 N_FAST = 3  # an export takes ten seconds
+DEPLOY = Path(__file__).parents[2] / "examples" / "deploy.py"
 TYPES = {"tensor(float)": np.float32, "tensor(int64)": np.int64, "tensor(bool)": bool}
 
 
@@ -156,6 +161,35 @@ def test_the_file_says_what_a_caller_needs(pair):
     assert settings["context_length"] == model.context_length
     assert settings["chunk_size"] == policy.chunk_size
     assert policy.acting_settings().items() <= settings.items()
+
+
+@pytest.mark.slow
+def test_choices_are_those_of_predict(tmp_path):
+    """By way of the example, which acts in one environment; and drawn from noise that is given."""
+    space = Signs().action_space
+    buffer = TrajectoryBuffer.from_trajectories(record(error=0.3), space)
+    model = make_model(DT, buffer, learning_rate=3e-3, policy_kwargs={"tokens_per_step": 1, "kv_cache": True}).learn(20)
+    model.export(tmp_path / "policy.onnx")
+    spec = importlib.util.spec_from_file_location("deploy", DEPLOY)
+    deploy = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(deploy)
+    exported, env = deploy.Policy(str(tmp_path / "policy.onnx")), make_signs()
+    for episode in range(2):
+        observation, _ = env.reset(seed=episode)
+        for _ in range(10):
+            expected, _ = model.predict(observation, deterministic=True)
+            found = exported.act(*(observation[key].squeeze() for key in ("observation", "return_to_go", "timestep")))
+            assert space.contains(found)
+            assert found == expected
+            observation, *_ = env.step(found)
+    generator = th.Generator().manual_seed(3)
+    model.policy.seed_noise(3)
+    many = {key: np.stack([value] * 500) for key, value in env.reset(seed=5)[0].items()}
+    drawn, _ = model.predict(many, episode_start=np.ones(500, bool))
+    noise = th.randn(500, space.n, generator=generator).numpy()
+    chunks = Exported(tmp_path / "policy.onnx", 500).act(many, noise)
+    assert (space.start + chunks.argmax(axis=1)).tolist() == drawn.tolist()
+    assert len(set(drawn.tolist())) > 1
 
 
 def test_exporting_changes_nothing_of_the_model(buffer):
