@@ -71,6 +71,18 @@ def record_video(model: FoundModel, arguments: Sequence[str]) -> None:
         rl_zoo3.utils.get_model_path = get_model_path
 
 
+def plot(name: str, arguments: Sequence[str]) -> None:
+    """
+    Plot runs.
+
+    :param name: of a script in `rl_zoo3.plots`
+    :param arguments: its arguments
+    """
+    import rl_zoo3.plots  # it asks for seaborn
+
+    _call(getattr(rl_zoo3.plots, name), f"plot {name}", arguments)
+
+
 def find_model(exp_id: int, folder: str, algo: str, env_name: EnvironmentName, *args: Any, **kwargs: Any) -> FoundModel:
     """
     RL-Zoo's `get_model_path`; but the latest run is the latest that has such a model, as a search for hyperparameters and a
