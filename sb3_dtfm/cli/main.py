@@ -22,6 +22,8 @@ COMMANDS = {
     "plot": "Draw the learning curve of a run of `train`.",
     "sweep": "Ask trained models for one return after the other, and see what they reach.",
     "export": "Write a trained policy into one ONNX file.",
+    "push": "Upload a trained model to Hugging Face's hub, with a card and a video.",
+    "pull": "Download a model from there, as a run.",
     "benchmark": "Compare DT and DTFM on a grid of tasks, shares of the data and seeds.",
     "report": "Make tables and figures from the results of `benchmark`.",
 }
