@@ -116,7 +116,7 @@ def _runs(folder: Path, env_name: EnvironmentName) -> list[int]:
     return sorted((int(match[1]) for match in named if match), reverse=True)
 
 
-def _call(function: Callable[[], None], command: str, arguments: Sequence[str]) -> None:
+def _call(function: Callable[[], object], command: str, arguments: Sequence[str]) -> None:
     saved = sys.argv
     sys.argv = [f"sb3-dtfm {command}", *arguments]
     try:

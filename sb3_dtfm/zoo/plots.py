@@ -75,7 +75,7 @@ def _save(name: str, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for figure in figures:
-        label = re.sub(r"[^\w-]+", "-", figure.get_label())
+        label = re.sub(r"[^\w-]+", "-", str(figure.get_label()))
         paths.append(folder / f"{name}-{label}.png")
         figure.savefig(paths[-1], dpi=150)
     plt.close("all")
