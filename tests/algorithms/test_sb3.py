@@ -28,6 +28,7 @@ from stable_baselines3.common.vec_env import (
     VecExtractDictObs,
     VecMonitor,
     VecNormalize,
+    VecTransposeImage,
 )
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -137,7 +138,8 @@ def test_what_asks_for_training_episodes_says_that_there_are_none(callback, miss
 
 
 def test_vectorised_wrappers_that_leave_observations_alone(cheetah_buffer):
-    env = VecNormalize(VecCheckNan(VecMonitor(DummyVecEnv([make_env] * 2)), raise_exception=True), norm_obs=False)
+    env = VecCheckNan(VecMonitor(VecTransposeImage(DummyVecEnv([make_env] * 2))), raise_exception=True)
+    env = VecNormalize(env, norm_obs=False)
     model = make_model(DTFM, cheetah_buffer, env=env).learn(2)
     rewards, lengths = evaluate_policy(model, env, 2, return_episode_rewards=True)
     assert np.isfinite(rewards).all()
