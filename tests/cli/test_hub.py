@@ -1,7 +1,10 @@
 """What is pushed and pulled, through a folder instead of the hub."""
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -10,6 +13,7 @@ from stable_baselines3 import PPO
 
 from sb3_dtfm import DT
 from sb3_dtfm.cli.main import main
+from tests.cli.local_hub import running
 from tests.recorded import DATASET_ID, tiny_training
 
 MODEL = ["--algo", "dt", "--env", "HalfCheetah-v5", "-orga", "someone"]
@@ -84,6 +88,28 @@ def test_a_pulled_run_is_what_was_pushed_and_enjoy_takes_it(repository, pushed, 
     assert len(ours) == 2
     assert main([*enjoy, "-f", str(pushed / "logs")]) == 0
     assert capsys.readouterr().out.split("Episode Reward")[1:] == ours
+
+
+def test_through_a_hub_goes_what_goes_through_a_folder(pushed, repository, monkeypatch, capsys):
+    """In a process of its own, as the client reads its settings when it is imported."""
+    with running() as hub:
+        variables = {"HF_ENDPOINT": hub.address, "HF_HOME": str(repository / "cache"), "HF_TOKEN": "hf_nobody"}
+        environment = {**os.environ, **variables, "HF_HUB_DISABLE_XET": "1"}
+
+        def command(name: str, *arguments: str) -> str:
+            line = [sys.executable, "-m", "sb3_dtfm", name, *MODEL, *arguments]
+            return subprocess.run(line, env=environment, capture_output=True, text=True, check=True).stdout
+
+        monkeypatch.chdir(pushed)
+        address = command("push", *QUICK, "--no-render").splitlines()[-1]
+        assert address == f"Repository: {hub.address}/someone/dt-HalfCheetah-v5"
+        (files,) = hub.repositories.values()
+        assert set(files) - {".gitattributes"} == {path.name for path in repository.glob("*.*")} - {"replay.mp4"}
+        for name in ("dt-HalfCheetah-v5.zip", "settings.json"):
+            assert files[name] == (repository / name).read_bytes()
+        assert "Run: pulled/dt/HalfCheetah-v5_1" in command("pull", "-f", "pulled")
+    model = "dt/HalfCheetah-v5_1/HalfCheetah-v5.zip"
+    assert Path("pulled", model).read_bytes() == Path("logs", model).read_bytes()
 
 
 @pytest.mark.parametrize(

@@ -26,10 +26,10 @@ VIDEO = ["video", "--algo", "dtfm", "--env", "HalfCheetah-v5", *SMALL]
 
 @pytest.fixture
 def trained(workplace, monkeypatch) -> Path:
-    """The folder of a run with two checkpoints, and a later one that has no model, as -optimize leaves it."""
+    """The folder of a run with a checkpoint, and a later one that has no model, as -optimize leaves it."""
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.delenv("DISPLAY", raising=False)
-    settings = ["--dataset", DATASET_ID, "--conf-file", "small", "--eval-freq", "-1", "--save-freq", "2"]
+    settings = ["--dataset", DATASET_ID, "--conf-file", "small", "--eval-freq", "-1", "--save-freq", "3"]
     assert main(tiny_training("dtfm", *settings)) == 0
     (workplace / "logs" / "dtfm" / "HalfCheetah-v5_10").mkdir()
     return Path("logs", "dtfm", "HalfCheetah-v5_1")
@@ -56,7 +56,7 @@ def test_the_latest_model_is_filmed_without_a_screen_and_any_setting(trained, ca
 def test_a_gif_of_a_training_shows_all_its_models_with_their_names(trained):
     assert main([*VIDEO, "--training", "-o", "all.gif"]) == 0
     pictures = frames(Path("all.gif"))
-    assert len(pictures) > 3
+    assert len(pictures) >= 3
     assert pictures[0].shape == (64, 96, 3)
     title = [picture[:32] for picture in (pictures[0], pictures[-1])]
     assert all(part.max() > 200 for part in title), "white letters"
