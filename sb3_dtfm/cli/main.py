@@ -20,9 +20,12 @@ COMMANDS = {
     "inspect": "Show what is in a dataset, and a return to ask for.",
     "record": "Make a dataset from a trained agent or a scripted demonstrator.",
     "demo": "Record, train and evaluate on robosuite's Lift, start to end.",
+    "video": "Film a trained model, as an MP4 or a GIF.",
     "plot": "Draw the learning curve of a run of `train`.",
     "sweep": "Ask trained models for one return after the other, and see what they reach.",
     "export": "Write a trained policy into one ONNX file.",
+    "push": "Upload a trained model to Hugging Face's hub, with a card and a video.",
+    "pull": "Download a model from there, as a run.",
     "benchmark": "Compare DT and DTFM on a grid of tasks, shares of the data and seeds.",
     "report": "Make tables and figures from the results of `benchmark`.",
 }

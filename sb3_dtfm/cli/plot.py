@@ -1,4 +1,4 @@
-"""`sb3-dtfm plot`: a run's evaluations and training loss over gradient steps."""
+"""`sb3-dtfm plot`: a run's evaluations and training loss over gradient steps; or RL-Zoo's plots of many runs."""
 
 import argparse
 from collections.abc import Sequence
@@ -12,6 +12,15 @@ from sb3_dtfm.benchmark.report.statistics import wilson
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+EPILOG = """\
+RL-Zoo's own scripts, each with its arguments, `--help` among them:
+  sb3-dtfm plot all_plots -a dtfm sac -e HalfCheetah-v5 -f logs -o results   evaluations of many runs: curves and a table
+  sb3-dtfm plot plot_from_file -i results.pkl                                what all_plots has written with -o
+  sb3-dtfm plot plot_train -a sac -e HalfCheetah-v5 -f logs                  training episodes, which dt and dtfm do not have
+Their figures are windows; with --figures FOLDER, or without a screen, they are PNG files.
+"""
+# Of RL-Zoo.
+SCRIPTS = ("all_plots", "plot_from_file", "plot_train")
 COLORS = {"evaluation": "#1b6ca8", "loss": "#c0562b"}
 
 
@@ -21,15 +30,28 @@ def main(argv: Sequence[str]) -> None:
 
     :param argv: its arguments
     """
+    if argv and argv[0] in SCRIPTS:
+        _run_script(argv[0], argv[1:])
+        return
     parser = argparse.ArgumentParser(
-        prog="sb3-dtfm plot", description="Draw evaluation and training loss of one run of `sb3-dtfm train` into a PNG."
+        prog="sb3-dtfm plot",
+        description="Draw evaluation and training loss of one run of `sb3-dtfm train` into a PNG.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("run_folder", help="e.g. logs/dtfm/robosuite-Lift-v0_1")
+    parser.add_argument("run_folder", help="e.g. logs/dtfm/robosuite-Lift-v0_1, or one of RL-Zoo's scripts, see below")
     parser.add_argument("--tensorboard", metavar="FOLDER", help="folder of the run's TensorBoard events, for the loss")
     parser.add_argument("--output", metavar="FILE", help="learning_curve.png in the run folder by default")
     options = parser.parse_args(argv)
     output = options.output or Path(options.run_folder) / "learning_curve.png"
     print(f"Learning curve: {plot_learning_curve(options.run_folder, output, options.tensorboard)}")
+
+
+def _run_script(name: str, arguments: Sequence[str]) -> None:
+    from sb3_dtfm.zoo.plots import draw
+
+    for path in draw(name, arguments):
+        print(f"Figure: {path}")
 
 
 def load_evaluations(run_folder: Path | str) -> dict[str, np.ndarray]:

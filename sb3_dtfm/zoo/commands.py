@@ -1,16 +1,34 @@
-"""RL-Zoo's `train` and `enjoy` as functions of their arguments, which they read from `sys.argv`."""
+"""RL-Zoo's scripts as functions of their arguments, which they read from `sys.argv`."""
 
 import functools
+import re
+import runpy
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import rl_zoo3.enjoy
 import rl_zoo3.train
+import rl_zoo3.utils
+from huggingface_sb3 import EnvironmentName
 from rl_zoo3.utils import get_model_path
 
 from sb3_dtfm.zoo.manager import OfflineExperimentManager
+
+
+class FoundModel(NamedTuple):
+    """
+    A model in the folder of a run, as RL-Zoo's `get_model_path` tells of it.
+
+    :param prefix: which of the run's models it is, for the names of videos
+    :param path: its zip file
+    :param run: the run's folder
+    """
+
+    prefix: str
+    path: str
+    run: str
 
 
 def train(arguments: Sequence[str], resumed: Path | None = None) -> None:
@@ -34,20 +52,71 @@ def enjoy(arguments: Sequence[str]) -> None:
     :param arguments: of RL-Zoo's `enjoy`
     :raises FileNotFoundError: no such run, or no such model in it
     """
-    rl_zoo3.enjoy.get_model_path = _find_model
+    rl_zoo3.enjoy.get_model_path = find_model
     _call(rl_zoo3.enjoy.enjoy, "enjoy", arguments)
 
 
-def _find_model(exp_id: int, folder: str, *args: Any, **kwargs: Any) -> tuple[str, str, str]:
+def record_video(model: FoundModel, arguments: Sequence[str]) -> None:
+    """
+    Film a trained model.
+
+    :param model: to act
+    :param arguments: of RL-Zoo's `record_video`, but for those that choose a model
+    """
+    get_model_path = rl_zoo3.utils.get_model_path
+    rl_zoo3.utils.get_model_path = lambda *_: model
     try:
-        return get_model_path(exp_id, folder, *args, **kwargs)
-    except (AssertionError, ValueError) as error:
-        if "rl-trained-agents" in folder:  # RL-Zoo waits for such an error to download the agent
-            raise
-        raise FileNotFoundError(f"{error}. -f names the folder that train wrote to, --exp-id the run in it.") from error
+        _call(lambda: runpy.run_module("rl_zoo3.record_video", run_name="__main__"), "video", arguments)
+    finally:
+        rl_zoo3.utils.get_model_path = get_model_path
 
 
-def _call(function: Callable[[], None], command: str, arguments: Sequence[str]) -> None:
+def plot(name: str, arguments: Sequence[str]) -> None:
+    """
+    Plot runs.
+
+    :param name: of a script in `rl_zoo3.plots`
+    :param arguments: its arguments
+    """
+    import rl_zoo3.plots  # it asks for seaborn
+
+    _call(getattr(rl_zoo3.plots, name), f"plot {name}", arguments)
+
+
+def find_model(exp_id: int, folder: str, algo: str, env_name: EnvironmentName, *args: Any, **kwargs: Any) -> FoundModel:
+    """
+    RL-Zoo's `get_model_path`; but the latest run is the latest that has such a model, as a search for hyperparameters and a
+    run that has just begun have none.
+
+    :param exp_id: number of a run, 0 for the latest, -1 for no folder of a run
+    :param folder: of all runs
+    :param algo: of the run
+    :param env_name: of the run
+    :raises FileNotFoundError: no such run, or no such model in it
+    """
+    ids = [exp_id] if exp_id else _runs(Path(folder, algo), env_name) or [0]
+    errors = []
+    for number in ids:
+        try:
+            found = FoundModel(*get_model_path(number, folder, algo, env_name, *args, **kwargs))
+        except (AssertionError, ValueError) as error:
+            errors.append(error)
+        else:
+            if not exp_id:
+                print(f"Loading latest experiment that has such a model, id={number}")
+            return found
+    if "rl-trained-agents" in folder:  # RL-Zoo waits for such an error to download the agent
+        raise errors[0]
+    raise FileNotFoundError(f"{errors[0]}. -f names the folder that train wrote to, --exp-id the run in it.") from errors[0]
+
+
+def _runs(folder: Path, env_name: EnvironmentName) -> list[int]:
+    """Numbers of the runs of a task, the latest first."""
+    named = (re.fullmatch(rf"{re.escape(env_name)}_(\d+)", path.name) for path in folder.glob("*/"))
+    return sorted((int(match[1]) for match in named if match), reverse=True)
+
+
+def _call(function: Callable[[], object], command: str, arguments: Sequence[str]) -> None:
     saved = sys.argv
     sys.argv = [f"sb3-dtfm {command}", *arguments]
     try:
