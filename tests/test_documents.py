@@ -190,8 +190,11 @@ def understand(words: list[str]) -> None:
     program, *arguments = words
     if program == "sb3-dtfm":
         assert arguments[0] in COMMANDS
-        command = importlib.import_module(f"sb3_dtfm.cli.{arguments[0]}").main
-        parse_only(lambda: command(arguments[1:]))
+        module = importlib.import_module(f"sb3_dtfm.cli.{arguments[0]}")
+        if arguments[0] == "video":  # it looks for the model before RL-Zoo's script parses what is left, nothing here
+            assert module._parser().parse_known_args(arguments[1:])[1] == []
+        else:
+            parse_only(lambda: module.main(arguments[1:]))
     elif program == "torchrun":
         options = get_args_parser().parse_args(arguments)
         assert options.module

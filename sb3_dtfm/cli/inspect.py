@@ -63,7 +63,8 @@ def table(buffer: TrajectoryBuffer, found: Inspection) -> list[str]:
     :param found: in it
     :return: lines of Markdown
     """
-    returns, lengths = buffer.episode_returns, buffer.episode_lengths
+    returns, lengths, successes = buffer.episode_returns, buffer.episode_lengths, buffer.successes
+    told = int((~np.isnan(successes)).sum())
     n_stopped = int((~buffer.terminated & ~buffer.truncated).sum())
     ends = f"{buffer.terminated.sum()} terminated, {buffer.truncated.sum()} truncated, {n_stopped} just stop"
     spread = f"{lengths.min():,} to {lengths.max():,}, {np.median(lengths):,.6g} in the median"
@@ -72,6 +73,7 @@ def table(buffer: TrajectoryBuffer, found: Inspection) -> list[str]:
         "task": buffer.env_id or "not said",
         "episodes": f"{buffer.n_episodes:,}: {ends}",
         "steps": f"{len(buffer):,}; an episode has {spread}",
+        "successes": f"{np.nansum(successes):,.0f} of {told:,}" if told else "not said",
         "returns": f"{returns.mean():,.6g} on average; worst, 10 %, median, 90 %, best: {tenths}",
         "observations": _numbers(found.observations),
         "actions": _actions(buffer, found),

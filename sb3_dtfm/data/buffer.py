@@ -216,6 +216,11 @@ class TrajectoryBuffer:
         return self.episodes.truncated
 
     @property
+    def successes(self) -> np.ndarray:
+        """(E,) float64: 1 where the task was done at the last step, 0 where not, NaN where the data do not tell"""
+        return self.episodes.successes
+
+    @property
     def timesteps(self) -> th.Tensor:
         """(len(self),) int64, the buffer's own steps counted from their episodes' starts; made anew at each call."""
         lengths = th.from_numpy(self.episodes.lengths).to(self._firsts.device)
@@ -267,16 +272,19 @@ class TrajectoryBuffer:
         chosen._set_episodes(self.episodes.select(episodes))
         return chosen
 
-    def best(self, min_return: float | None = None, best_share: float | None = None) -> "TrajectoryBuffer":
+    def best(
+        self, min_return: float | None = None, best_share: float | None = None, success_only: bool = False
+    ) -> "TrajectoryBuffer":
         """
         A buffer of the better episodes, in their order.
 
         :param min_return: the smallest return that is kept, environment reward units; None keeps all
         :param best_share: share of the episodes in (0, 1], those of the largest returns; at least one is kept
-        :raises DatasetError: no episode has such a return
+        :param success_only: keep the successes, of which the best share is then taken
+        :raises DatasetError: no episode has such a return, none is a success, or the data do not tell
         :raises ValueError: `best_share` outside of (0, 1]
         """
-        buffer = self
+        buffer = self._succeeded() if success_only else self
         if min_return is not None:
             kept = np.flatnonzero(buffer.episode_returns >= min_return)
             if not len(kept):
@@ -289,6 +297,15 @@ class TrajectoryBuffer:
             n_kept = max(1, round(best_share * buffer.n_episodes))
             buffer = buffer.select(np.sort(np.argsort(-buffer.episode_returns, kind="stable")[:n_kept]))
         return buffer
+
+    def _succeeded(self) -> "TrajectoryBuffer":
+        silent = np.flatnonzero(np.isnan(self.successes))
+        if len(silent):
+            found = f"of {len(silent)} of {self.n_episodes} episodes the data do not tell whether they succeeded"
+            raise DatasetError(f"{self.source}: success_only, but {found}; min_return chooses by the return.")
+        if not self.successes.any():
+            raise DatasetError(f"{self.source}: success_only, but none of {self.n_episodes} episodes is a success.")
+        return self.select(np.flatnonzero(self.successes))
 
     @classmethod
     def join(cls, buffers: Sequence["TrajectoryBuffer"], weights: Sequence[float]) -> "TrajectoryBuffer":
@@ -355,6 +372,8 @@ class TrajectoryBuffer:
         steps["actions"] = from_vectors(steps["actions"], self.action_space)
         space = dict(zip(("action_low", "action_high"), bounds_of(self.action_space), strict=True))
         named = {} if self.env_id is None else {"env_id": np.array(self.env_id)}
+        if not np.isnan(self.successes).any():
+            named["successes"] = self.successes.astype(bool)
         with replacing(path) as beside, open(beside, "wb") as file:
             np.savez(file, **steps, **ended, episode_ends=stops, **space, **named)
 
@@ -541,6 +560,7 @@ def _episode_row(trajectory: Trajectory, start: int, to_go: np.ndarray) -> tuple
         to_go[0],  # the return: the sum of all rewards in float64
         trajectory.terminated,
         trajectory.truncated,
+        np.nan if trajectory.success is None else float(trajectory.success),
         *moments(trajectory.observations),
         max(to_go.max(), -to_go.min()),
     )

@@ -33,9 +33,9 @@ class EpisodeTable(NamedTuple):
     One row per episode.
 
     Shapes: starts (E,) int64, the episodes' first rows in the flat step arrays; lengths (E,) int64 steps; returns (E,)
-    float64, environment reward units; terminated (E,) and truncated (E,) bool; observation_means (E, O) float64;
-    observation_squares (E, O) float64, sums of squared deviations from these means; return_scales (E,) float64, largest
-    absolute returns-to-go.
+    float64, environment reward units; terminated (E,) and truncated (E,) bool; successes (E,) float64, 1 or 0, NaN where the
+    data do not tell; observation_means (E, O) float64; observation_squares (E, O) float64, sums of squared deviations from
+    these means; return_scales (E,) float64, largest absolute returns-to-go.
     """
 
     starts: np.ndarray
@@ -43,6 +43,7 @@ class EpisodeTable(NamedTuple):
     returns: np.ndarray
     terminated: np.ndarray
     truncated: np.ndarray
+    successes: np.ndarray
     observation_means: np.ndarray
     observation_squares: np.ndarray
     return_scales: np.ndarray

@@ -29,6 +29,7 @@ REWARDS = ("rewards", "reward", "rews")
 ENDS, LENGTHS = "episode_ends", "episode_lengths"
 TERMINATIONS = ("terminations", "terminals", "terminated", "terminal")
 TRUNCATIONS = ("truncations", "timeouts", "truncated")
+SUCCESSES = ("successes", "success", "is_success", "infos/success", "infos/is_success")
 # Of what is no file.
 NUMBERS_EXPECTED = "arrays of numbers are expected"
 # What TrajectoryBuffer.save adds.
@@ -95,9 +96,10 @@ def load_flat(
 
     Read are `observations` (N, O), `actions` (N, A), or whole numbers (N,) of a Discrete space, and `rewards` (N,), or what
     others call them (`obs`, `state`, `action`, `reward`). Episodes end where `episode_ends` says (E,), counting steps from
-    the start of the file, or after `episode_lengths` (E,) each, or at the steps of `terminals` or `timeouts` (N,). Without
-    rewards every episode counts as a success: a reward of 1 at its last step. Nothing in a file is ever executed: arrays of
-    Python objects are refused. The arrays are read into memory, also to write a cache of them.
+    the start of the file, or after `episode_lengths` (E,) each, or at the steps of `terminals` or `timeouts` (N,). `success`
+    tells of each episode (E,), or of each step (N,), and then an episode's last one counts. Without rewards a success has a
+    reward of 1 at its last step, and where nothing tells every episode is one. Nothing in a file is ever executed: arrays
+    of Python objects are refused. The arrays are read into memory, also to write a cache of them.
 
     :param dataset: path of the file, or arrays by name
     :param observation_keys: which arrays make up the observation, in this order, each (N, ...)
@@ -208,7 +210,9 @@ class _Hdf5(_Arrays):
     """Of an opened file, at its top."""
 
     def __init__(self, file: h5py.File, source: str) -> None:
-        super().__init__(source, set(file), os.path.getsize(source))
+        infos = file.get("infos")
+        within = {f"infos/{name}" for name in infos} if isinstance(infos, h5py.Group) else set()
+        super().__init__(source, {*file, *within}, os.path.getsize(source))
         self._file = file
 
     def _get(self, name: str, where: str) -> np.ndarray:
@@ -264,9 +268,11 @@ def _read(
     rewards = arrays.read(REWARDS, n_steps).reshape(n_steps, -1) if has_rewards else np.zeros((n_steps, 1))
     if rewards.shape[1] != 1:
         raise DatasetError(f"{source}: rewards have {rewards.shape[1]} columns; one number a step is expected.")
+    successes = _successes(arrays, n_steps, stops)
     if not has_rewards:
-        rewards[stops - 1] = 1.0
-        terminated[stops - 1] = True
+        done = stops - 1 if successes is None else stops[successes] - 1
+        rewards[done] = 1.0
+        terminated[done] = True
     if action_bounds is None and arrays.has((LOW,)):
         action_bounds = arrays.read((LOW,)), arrays.read((HIGH,))
     action_space = bounded_space(action_bounds, action_space, actions, source)
@@ -280,6 +286,7 @@ def _read(
             rewards=rewards[start:stop, 0],
             terminated=bool(terminated[stop - 1]),
             truncated=bool(truncated[stop - 1]),
+            success=None if successes is None else bool(successes[episode]),
             name=f"episode {episode}",
         )
 
@@ -307,6 +314,16 @@ def _flags(arrays: _Arrays, names: Sequence[str], n_steps: int) -> np.ndarray:
     if not arrays.has(names):
         return np.zeros(n_steps, bool)
     return check_flags(arrays.read(names), n_steps, f"{arrays.source}: {arrays.name(names)}")
+
+
+def _successes(arrays: _Arrays, n_steps: int, stops: np.ndarray) -> np.ndarray | None:
+    """(E,) bool, None where there is no such array."""
+    if not arrays.has(SUCCESSES):
+        return None
+    array, where = arrays.read(SUCCESSES), f"{arrays.source}: {arrays.name(SUCCESSES)}"
+    if len(array) != len(stops):
+        return check_flags(array, n_steps, where)[stops - 1]
+    return check_flags(array, len(stops), where)
 
 
 def _stops(arrays: _Arrays, n_steps: int, ended: np.ndarray) -> np.ndarray:

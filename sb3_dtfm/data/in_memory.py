@@ -17,6 +17,7 @@ from sb3_dtfm.data.flat import (
     NUMBERS_EXPECTED,
     OBSERVATIONS,
     REWARDS,
+    SUCCESSES,
     TERMINATIONS,
     TRUNCATIONS,
     bounded_space,
@@ -27,6 +28,7 @@ from sb3_dtfm.data.observations import as_vectors, flatten_observations
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_space, naming
 from sb3_dtfm.envs.return_to_go import flatten_observation_space, sort_observation_space
+from sb3_dtfm.envs.success import reported_success
 
 # What one step of an episode that was written down step by step holds.
 STEP = ("observation", "action", "reward", "terminated", "truncated")
@@ -49,14 +51,15 @@ def load_episodes(
     Episodes one by one, each of which may be
 
     - a dictionary of `observations` (T, O) or (T + 1, O), `actions` (T, A), or (T,) of a Discrete space, `rewards` (T,), and
-      `terminated` and `truncated`, for the episode or for each step, or what others call them; observations may be
-      dictionaries, too
+      `terminated`, `truncated` and `success`, for the episode or for each step, or what others call them; observations may
+      be dictionaries, too
     - a :class:`~sb3_dtfm.data.Trajectory`
     - a trajectory of the package imitation: `obs`, `acts`, `terminal`, `rews` where it has some
     - a list of steps `(observation, action, reward, terminated, truncated)`, as they come from a Gymnasium environment:
-      the observation that the action was chosen on, and what `env.step(action)` then returned, info or not
+      the observation that the action was chosen on, and what `env.step(action)` then returned, with the info, whose success
+      is known of the episode, or without
 
-    Without rewards an episode counts as a success: a reward of 1 at its last step.
+    Without rewards a success has a reward of 1 at its last step, and every episode is one where nothing tells.
 
     :param episodes: at least one
     :param action_bounds: see :func:`~sb3_dtfm.data.load_flat`
@@ -105,12 +108,15 @@ def _trajectory(episode: Any, number: int, source: str) -> Trajectory:
         if hasattr(episode, "obs") and hasattr(episode, "acts"):
             ended = bool(episode.terminal)
             infos = getattr(episode, "infos", None)
-            late = ended and infos is not None and bool(infos[-1].get("TimeLimit.truncated", False))
+            info = {} if infos is None else infos[-1]
+            late = ended and bool(info.get("TimeLimit.truncated", False))
             arrays = {"obs": episode.obs, "acts": episode.acts, "terminated": ended and not late, "truncated": late}
+            arrays["success"] = reported_success(info)
             return _of_arrays({**arrays, **({"rews": episode.rews} if hasattr(episode, "rews") else {})}, name, where)
         if is_episodes(episode) and all(is_episodes(step) and len(step) >= len(STEP) for step in episode):
             observations, actions, rewards, terminated, truncated = list(zip(*episode, strict=False))[: len(STEP)]
             arrays = {"obs": _stacked(observations), "acts": actions, "rews": rewards}
+            arrays["success"] = reported_success(episode[-1][len(STEP)]) if len(episode[-1]) > len(STEP) else None
             return _of_arrays({**arrays, "terminated": terminated, "truncated": truncated}, name, where)
     raise DatasetError(
         f"{where} is a {type(episode).__name__}; accepted are a dictionary of arrays, a Trajectory, a trajectory of "
@@ -142,20 +148,24 @@ def _of_arrays(arrays: Mapping[str, Any], name: str, where: str) -> Trajectory:
             raise DatasetError(f"{where}: ends at step {step} of {len(given[0])}; arrays of several episodes need no list.")
         return bool(given[0][-1]) if given else False
 
+    successes = [np.asarray(arrays[key]).reshape(-1) for key in SUCCESSES if arrays.get(key) is not None]
+
     actions = np.asarray(find(ACTIONS))
     n_steps = len(actions) if actions.ndim else 0
     observations = as_vectors(find(OBSERVATIONS), f"{where}: observations")
     if len(observations) == n_steps + 1:  # the last one, after which nobody has acted
         observations = observations[:n_steps]
     has_rewards = any(key in arrays for key in REWARDS)
-    rewards = np.asarray(find(REWARDS)) if has_rewards else np.eye(1, n_steps, n_steps - 1)[0]
+    success = bool(successes[0][-1]) if successes else None
+    rewards = np.asarray(find(REWARDS)) if has_rewards else (success is not False) * np.eye(1, n_steps, n_steps - 1)[0]
     terminated, truncated = flag(TERMINATIONS), flag(TRUNCATIONS)
     return Trajectory(
         observations=observations,
         actions=actions,
         rewards=rewards.reshape(n_steps) if rewards.size == n_steps else rewards,
-        terminated=terminated or not (has_rewards or truncated),
+        terminated=terminated or not (has_rewards or truncated or success is False),
         truncated=truncated,
+        success=success,
         name=name,
     )
 

@@ -118,6 +118,7 @@ def load_lerobot(
             rewards=rewards,
             terminated=terminated,
             truncated=not terminated,
+            success=None if success is None else bool(success.any()),
             name=f"episode {number}",
         )
 

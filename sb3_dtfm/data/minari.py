@@ -7,7 +7,7 @@ import reprlib
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import minari
@@ -30,6 +30,7 @@ METADATA_FILE_NAME, HDF5_FILE_NAME = "metadata.json", "main_data.hdf5"
 # Bytes that HDF5 may keep of a file's structure; its own limit is a third of a usual dataset's size.
 STRUCTURE_CACHE = 2**20
 EPISODE_KEYS = ("observations", "actions", "rewards", "terminations", "truncations")
+INFOS, SUCCESSES = "infos", ("is_success", "success")
 # Fields of metadata.json: types that each may have, and whether every dataset has it.
 FIELDS: dict[str, tuple[tuple[type, ...], bool]] = {
     "dataset_id": ((str,), True),
@@ -107,7 +108,7 @@ def load_minari(
         def trajectory(index: int) -> Trajectory:
             name = f"episode {index}"
             with naming(f"{source}, {name}"):
-                return make_trajectory(read(index), dataset.observation_space, name, source)
+                return make_trajectory(*read(index), dataset.observation_space, name, source)
 
         buffer = TrajectoryBuffer.from_trajectories(
             map(trajectory, dataset.episode_indices.tolist()),
@@ -240,7 +241,14 @@ def _score_reference(metadata: dict[str, Any]) -> ScoreReference | None:
     return ScoreReference(float(minimum), float(maximum), scale)
 
 
-def _hdf5_reader(stack: contextlib.ExitStack, folder: Path, source: str) -> Callable[[int], ReadArray]:
+class _Episode(NamedTuple):
+    """What reads an episode's arrays, and the infos' success, a flag a step, None where there is none."""
+
+    read: ReadArray
+    success: np.ndarray | None
+
+
+def _hdf5_reader(stack: contextlib.ExitStack, folder: Path, source: str) -> Callable[[int], _Episode]:
     """Reads the HDF5 file itself, since Minari's storage decodes all infos with every episode."""
     file = stack.enter_context(h5py.File(folder / HDF5_FILE_NAME, "r"))
     cache = file.id.get_mdc_config()
@@ -248,28 +256,36 @@ def _hdf5_reader(stack: contextlib.ExitStack, folder: Path, source: str) -> Call
     cache.initial_size = cache.min_size = cache.max_size = STRUCTURE_CACHE
     file.id.set_mdc_config(cache)
 
-    def episode(index: int) -> ReadArray:
+    def episode(index: int) -> _Episode:
         group = open_group(file, f"episode_{index}", source)
         where = f"{source}, episode {index}"
-        return lambda *path: read_hdf5(
-            group, "/".join(f"_index_{key}" if isinstance(key, int) else key for key in path), where
-        )
+        told = [name for name in SUCCESSES if INFOS in group and f"{INFOS}/{name}" in group][:1]
+
+        def array(*path: str | int) -> np.ndarray:
+            return read_hdf5(group, "/".join(f"_index_{key}" if isinstance(key, int) else key for key in path), where)
+
+        return _Episode(array, array(INFOS, told[0]) if told else None)
 
     return episode
 
 
-def _arrow_reader(data_format: str, folder: Path, source: str) -> Callable[[int], ReadArray]:
+def _arrow_reader(data_format: str, folder: Path, source: str) -> Callable[[int], _Episode]:
     """Reads the Arrow or Parquet files of an episode itself, since Minari's storage takes each for a single batch."""
     pyarrow = import_pyarrow(source)
 
-    def episode(index: int) -> ReadArray:
+    def episode(index: int) -> _Episode:
         files = pyarrow.dataset.dataset(
             folder / str(index), format=data_format, ignore_prefixes=["_", ".", METADATA_FILE_NAME]
         )
         missing = sorted(set(EPISODE_KEYS) - set(files.schema.names))
         if missing:
             raise DatasetError(f"{source}, episode {index}: holds no {', '.join(missing)}; the file is incomplete.")
-        table = files.to_table(columns=list(EPISODE_KEYS))
+        columns = {name: pyarrow.dataset.field(name) for name in EPISODE_KEYS}
+        infos = files.schema.field(INFOS).type if INFOS in files.schema.names else pyarrow.struct([])
+        told = [name for name in SUCCESSES if pyarrow.types.is_struct(infos) and infos.get_field_index(name) >= 0][:1]
+        if told:
+            columns[INFOS] = pyarrow.dataset.field(INFOS, told[0])
+        table = files.to_table(columns=columns)
         table.validate(full=True)
 
         def array(name: str, *path: str | int) -> np.ndarray:
@@ -277,23 +293,27 @@ def _arrow_reader(data_format: str, folder: Path, source: str) -> Callable[[int]
                 values = table[name].combine_chunks()
                 for key in path:
                     values = values.field(str(key))
-                # Observations are one more than actions: the other columns are stored with an entry that nobody gave.
-                values = values if name == "observations" else values[:-1]
+                # Observations and infos are one more than actions: other columns are stored with an entry that nobody gave.
+                values = values if name in ("observations", INFOS) else values[:-1]
                 if not pyarrow.types.is_fixed_size_list(values.type):
                     return values.to_numpy(zero_copy_only=False)
                 return values.flatten().to_numpy(zero_copy_only=False).reshape(len(values), -1)
 
-        return array
+        return _Episode(array, array(INFOS) if told else None)
 
     return episode
 
 
-def make_trajectory(read: ReadArray, observation_space: spaces.Space, name: str, source: str) -> Trajectory:
+def make_trajectory(
+    read: ReadArray, success: np.ndarray | None, observation_space: spaces.Space, name: str, source: str
+) -> Trajectory:
     """
     One episode of a Minari file.
 
     :param read: gives an array of observations, actions, rewards, terminations, truncations; a part of a Dict or Tuple
         by its keys
+    :param success: flags of the steps, whose last one tells of the episode, after one of its reset or not; None where
+        nothing is told
     :param observation_space: the dataset's own
     :param name: what the file calls the episode
     :param source: the file, for messages
@@ -320,5 +340,6 @@ def make_trajectory(read: ReadArray, observation_space: spaces.Space, name: str,
         rewards=rewards,
         terminated=bool(terminations[-1:].any()),
         truncated=bool(truncations[-1:].any()),
+        success=None if success is None else bool(check_flags(success, len(success), f"{where}: success")[-1:].any()),
         name=name,
     )

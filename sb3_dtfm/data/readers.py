@@ -27,7 +27,7 @@ Dataset: TypeAlias = (
     str | os.PathLike[str] | MinariDataset | Mapping[str, Any] | Sequence[Any] | ReplayBuffer | TrajectoryBuffer
 )
 # What load_dataset itself does with a dataset of any kind.
-COMMON_OPTIONS = ("env_id", "action_space", "min_return", "best_share")
+COMMON_OPTIONS = ("env_id", "action_space", "min_return", "best_share", "success_only")
 
 
 class Reader(NamedTuple):
@@ -98,6 +98,7 @@ def load_dataset(
     action_space: ActionSpace | None = None,
     min_return: float | None = None,
     best_share: float | None = None,
+    success_only: bool = False,
     **kwargs: Any,
 ) -> TrajectoryBuffer:
     """
@@ -111,9 +112,10 @@ def load_dataset(
         the first call and whenever the dataset has changed. None reads everything into memory
     :param env_id: Gymnasium id of the environment that the episodes count as coming from, whatever the dataset says
     :param action_space: the environment's, for data that do not tell of a range of actions
-    :param min_return: leave out episodes of a smaller return, environment reward units; of tasks that reward success with 1,
-        1 leaves the successes
+    :param min_return: leave out episodes of a smaller return, environment reward units
     :param best_share: keep this share of the episodes, those of the largest returns
+    :param success_only: keep the successes alone, by what the data say of each episode's last step; see
+        :attr:`TrajectoryBuffer.successes`
     :param kwargs: options of the reader: `on_invalid`, which is "raise" unless "drop" leaves episodes out that would be
         refused, with a warning that names their number and the first reason; `filter_key` and `observation_keys` for
         robomimic files, see also :func:`load_flat`
@@ -142,7 +144,7 @@ def load_dataset(
     if env_id is not None:
         buffer = copy.copy(buffer)
         buffer.env_id = env_id
-    return buffer.best(min_return, best_share)
+    return buffer.best(min_return, best_share, success_only)
 
 
 def _find_reader(dataset: Any) -> Reader:

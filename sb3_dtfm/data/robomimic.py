@@ -132,6 +132,7 @@ def _read(
                 rewards=rewards[name],
                 terminated=success,
                 truncated=done and not success,
+                success=success,
                 name=name,
             )
 

@@ -102,6 +102,7 @@ class Trajectory:
     :param rewards: (T,), environment reward units
     :param terminated: the last step reached a terminal state
     :param truncated: the last step hit a time limit; neither flag set means that the recording stopped mid-episode
+    :param success: whether the task was done at the last step; None where the data do not tell
     :param name: what the file calls this episode, for error messages
     """
 
@@ -110,6 +111,7 @@ class Trajectory:
     rewards: np.ndarray
     terminated: bool = False
     truncated: bool = False
+    success: bool | None = None
     name: str = "episode"
 
     def __len__(self) -> int:

@@ -28,7 +28,7 @@ class RecordedEpisode:
     :param rewards: T numbers, environment reward units
     :param terminated: ended in a terminal state
     :param truncated: ended at a time limit
-    :param success: what the environment said at the last step; None where it says nothing
+    :param reported: T times what the environment said of success; None where it said nothing
     :param states: T arrays (S,), the simulator's state before each action; empty unless asked for
     :param model_file: XML of the simulated scene; empty unless asked for
     """
@@ -39,9 +39,14 @@ class RecordedEpisode:
     rewards: list[float] = field(default_factory=list)
     terminated: bool = False
     truncated: bool = False
-    success: bool | None = None
+    reported: list[bool | None] = field(default_factory=list)
     states: list[np.ndarray] = field(default_factory=list)
     model_file: str = ""
+
+    @property
+    def success(self) -> bool | None:
+        """What the environment said at the last step."""
+        return self.reported[-1] if self.reported else None
 
 
 class EpisodeRecorder(gym.Wrapper):
@@ -77,7 +82,7 @@ class EpisodeRecorder(gym.Wrapper):
         episode.observations.append(copy.deepcopy(observation))
         episode.rewards.append(float(reward))
         episode.terminated, episode.truncated = bool(terminated), bool(truncated)
-        episode.success = reported_success(info)
+        episode.reported.append(reported_success(info))
         return observation, reward, terminated, truncated, info
 
 

@@ -115,6 +115,7 @@ def _n_bytes(observations: Any) -> int:
 def _episode_buffer(episode: RecordedEpisode) -> EpisodeBuffer:
     ends = np.zeros((2, len(episode.actions)), dtype=bool)
     ends[:, -1] = episode.terminated, episode.truncated
+    told = [False, *episode.reported]  # as many as observations
     return EpisodeBuffer(
         seed=episode.seed,
         observations=stack_observations(episode.observations),
@@ -122,6 +123,7 @@ def _episode_buffer(episode: RecordedEpisode) -> EpisodeBuffer:
         rewards=np.asarray(episode.rewards, dtype=np.float64),
         terminations=ends[0],
         truncations=ends[1],
+        infos=None if None in told else {"is_success": np.array(told)},
     )
 
 

@@ -54,9 +54,11 @@ class Handler(BaseHTTPRequestHandler):
         parts = self.path.strip("/").split("?")[0].split("/")
         if parts[0] == "api":
             repo_id = "/".join(parts[2:4])
-            files = [{"rfilename": path} for path in self.server.repositories.get(repo_id, {})]
             known = repo_id in self.server.repositories
-            self._answer({"id": repo_id, "sha": COMMIT, "siblings": files}, 200 if known else 404)
+            files = self.server.repositories.get(repo_id, {})
+            tree = [{"type": "file", "path": path, "size": len(files[path]), "oid": COMMIT} for path in files]
+            about = {"id": repo_id, "sha": COMMIT, "siblings": [{"rfilename": path} for path in files]}
+            self._answer(tree if parts[4:5] == ["tree"] else about, 200 if known else 404)
         else:  # /organization/name/resolve/revision/path
             content = self.server.repositories["/".join(parts[:2])]["/".join(parts[4:])]
             self._send(content, "application/octet-stream", 200)

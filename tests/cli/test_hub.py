@@ -98,7 +98,9 @@ def test_through_a_hub_goes_what_goes_through_a_folder(pushed, repository, monke
 
         def command(name: str, *arguments: str) -> str:
             line = [sys.executable, "-m", "sb3_dtfm", name, *MODEL, *arguments]
-            return subprocess.run(line, env=environment, capture_output=True, text=True, check=True).stdout
+            done = subprocess.run(line, env=environment, capture_output=True, text=True, check=False)
+            assert done.returncode == 0, done.stderr
+            return done.stdout
 
         monkeypatch.chdir(pushed)
         address = command("push", *QUICK, "--no-render").splitlines()[-1]

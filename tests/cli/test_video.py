@@ -64,11 +64,11 @@ def test_a_gif_of_a_training_shows_all_its_models_with_their_names(trained):
 
 
 def test_agents_of_rl_zoo_are_filmed_too(workplace):
-    arguments = ["--algo", "sac", "--env", "Pendulum-v1"]
+    arguments = ["--algo", "sac", "--env", "HalfCheetah-v5"]
     assert main(["train", *arguments, "-n", "12", "--eval-freq", "-1", "-params", "learning_starts:10"]) == 0
     assert main(["video", *arguments, "-n", "2", "-g"]) == 0
-    (video,) = Path("logs/sac/Pendulum-v1_1/videos").iterdir()
-    assert video.name == "final-model-sac-Pendulum-v1-step-0-to-step-2.gif"
+    (video,) = Path("logs/sac/HalfCheetah-v5_1/videos").iterdir()
+    assert video.name == "final-model-sac-HalfCheetah-v5-step-0-to-step-2.gif"
     assert frames(video)[0].std() > 0
 
 

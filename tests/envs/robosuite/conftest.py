@@ -45,9 +45,13 @@ def rollout(env, n_steps=15, seed=None, options=None):
     return np.stack(observations)
 
 
+# What MuJoCo, once it has drawn here, has left for PyOpenGL is chosen anew, too.
+CHOSEN = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "PYTHONHASHSEED")
+
+
 def run_python(code, *arguments, **environment):
     """Run a program in another process, which chooses its own rendering backend and order of sets."""
-    variables = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "PYTHONHASHSEED")}
+    variables = {name: value for name, value in os.environ.items() if name not in CHOSEN}
     return subprocess.run(
         [sys.executable, "-c", code, *arguments],
         env={**variables, **environment},
