@@ -2,13 +2,16 @@
 
 from typing import Any
 
+# SB3's name of it, and that of gymnasium-robotics' mazes and hands.
+SUCCESS = ("is_success", "success")
+
 
 def reported_success(info: dict[str, Any]) -> bool | None:
     """
-    Whether an episode succeeded: by SB3's name of it, or that of gymnasium-robotics' mazes and hands.
+    Whether an episode succeeded.
 
     :param info: of the episode's last step
     :return: None where it says nothing
     """
-    success = info.get("is_success", info.get("success"))
+    success = next((info[name] for name in SUCCESS if name in info), None)
     return None if success is None else bool(success)

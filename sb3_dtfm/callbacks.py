@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 import torch as th
+from stable_baselines3.common import logger
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EventCallback, ProgressBarCallback
 
 from sb3_dtfm.data.trajectories import ScoreReference
@@ -160,8 +161,6 @@ class FlowFigure(BaseCallback):
         self.seed = seed
 
     def _on_step(self) -> bool:
-        from stable_baselines3.common import logger
-
         model: Any = self.model
         window = model.buffer.sample(1, model.context_length, th.Generator(model.device).manual_seed(self.seed))
         picture = logger.Figure(draw_flow(model.policy, window, self.seed), close=True)

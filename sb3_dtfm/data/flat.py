@@ -19,6 +19,7 @@ from sb3_dtfm.data.hdf5 import read_hdf5
 from sb3_dtfm.data.observations import as_vectors, check_no_images
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_flags, check_real, check_size, naming
+from sb3_dtfm.envs.success import SUCCESS
 
 NPZ_SUFFIX = ".npz"
 EXPECTED = "the path of a file of flat arrays (.npz, .hdf5)"
@@ -29,7 +30,7 @@ REWARDS = ("rewards", "reward", "rews")
 ENDS, LENGTHS = "episode_ends", "episode_lengths"
 TERMINATIONS = ("terminations", "terminals", "terminated", "terminal")
 TRUNCATIONS = ("truncations", "timeouts", "truncated")
-SUCCESSES = ("successes", "success", "is_success", "infos/success", "infos/is_success")
+SUCCESSES = ("successes", *SUCCESS, *(f"infos/{name}" for name in SUCCESS))
 # Of what is no file.
 NUMBERS_EXPECTED = "arrays of numbers are expected"
 # What TrajectoryBuffer.save adds.

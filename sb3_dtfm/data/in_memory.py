@@ -26,7 +26,7 @@ from sb3_dtfm.data.flat import (
 )
 from sb3_dtfm.data.observations import as_vectors, flatten_observations
 from sb3_dtfm.data.storage import FileStorage
-from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_space, naming
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_space, check_flags, naming
 from sb3_dtfm.envs.return_to_go import flatten_observation_space, sort_observation_space
 from sb3_dtfm.envs.success import reported_success
 
@@ -116,7 +116,8 @@ def _trajectory(episode: Any, number: int, source: str) -> Trajectory:
         if is_episodes(episode) and all(is_episodes(step) and len(step) >= len(STEP) for step in episode):
             observations, actions, rewards, terminated, truncated = list(zip(*episode, strict=False))[: len(STEP)]
             arrays = {"obs": _stacked(observations), "acts": actions, "rews": rewards}
-            arrays["success"] = reported_success(episode[-1][len(STEP)]) if len(episode[-1]) > len(STEP) else None
+            infos = [part for part in episode[-1][len(STEP) :] if isinstance(part, Mapping)]
+            arrays["success"] = reported_success(infos[0]) if infos else None
             return _of_arrays({**arrays, "terminated": terminated, "truncated": truncated}, name, where)
     raise DatasetError(
         f"{where} is a {type(episode).__name__}; accepted are a dictionary of arrays, a Trajectory, a trajectory of "
@@ -148,15 +149,13 @@ def _of_arrays(arrays: Mapping[str, Any], name: str, where: str) -> Trajectory:
             raise DatasetError(f"{where}: ends at step {step} of {len(given[0])}; arrays of several episodes need no list.")
         return bool(given[0][-1]) if given else False
 
-    successes = [np.asarray(arrays[key]).reshape(-1) for key in SUCCESSES if arrays.get(key) is not None]
-
     actions = np.asarray(find(ACTIONS))
     n_steps = len(actions) if actions.ndim else 0
     observations = as_vectors(find(OBSERVATIONS), f"{where}: observations")
     if len(observations) == n_steps + 1:  # the last one, after which nobody has acted
         observations = observations[:n_steps]
     has_rewards = any(key in arrays for key in REWARDS)
-    success = bool(successes[0][-1]) if successes else None
+    success = _success(arrays, n_steps, where)
     rewards = np.asarray(find(REWARDS)) if has_rewards else (success is not False) * np.eye(1, n_steps, n_steps - 1)[0]
     terminated, truncated = flag(TERMINATIONS), flag(TRUNCATIONS)
     return Trajectory(
@@ -168,6 +167,16 @@ def _of_arrays(arrays: Mapping[str, Any], name: str, where: str) -> Trajectory:
         success=success,
         name=name,
     )
+
+
+def _success(arrays: Mapping[str, Any], n_steps: int, where: str) -> bool | None:
+    """What an episode's arrays say of its last step, or of the episode."""
+    name = next((key for key in SUCCESSES if arrays.get(key) is not None), None)
+    if name is None:
+        return None
+    flags = np.asarray(arrays[name])
+    flags = flags.reshape(1) if flags.size == 1 else flags
+    return bool(check_flags(flags, 1 if len(flags) == 1 else n_steps, f"{where}: {name}")[-1])
 
 
 def is_replay_buffer(dataset: Any) -> bool:

@@ -25,12 +25,13 @@ from sb3_dtfm.data.observations import ReadArray, flatten_observations
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, check_flags, naming
 from sb3_dtfm.envs.return_to_go import flatten_observation_space, sort_observation_space
+from sb3_dtfm.envs.success import SUCCESS
 
 METADATA_FILE_NAME, HDF5_FILE_NAME = "metadata.json", "main_data.hdf5"
 # Bytes that HDF5 may keep of a file's structure; its own limit is a third of a usual dataset's size.
 STRUCTURE_CACHE = 2**20
 EPISODE_KEYS = ("observations", "actions", "rewards", "terminations", "truncations")
-INFOS, SUCCESSES = "infos", ("is_success", "success")
+INFOS = "infos"
 # Fields of metadata.json: types that each may have, and whether every dataset has it.
 FIELDS: dict[str, tuple[tuple[type, ...], bool]] = {
     "dataset_id": ((str,), True),
@@ -259,12 +260,13 @@ def _hdf5_reader(stack: contextlib.ExitStack, folder: Path, source: str) -> Call
     def episode(index: int) -> _Episode:
         group = open_group(file, f"episode_{index}", source)
         where = f"{source}, episode {index}"
-        told = [name for name in SUCCESSES if INFOS in group and f"{INFOS}/{name}" in group][:1]
+        infos = (f"{INFOS}/{name}" for name in SUCCESS if INFOS in group)
+        told = next((name for name in infos if name in group), None)
 
         def array(*path: str | int) -> np.ndarray:
             return read_hdf5(group, "/".join(f"_index_{key}" if isinstance(key, int) else key for key in path), where)
 
-        return _Episode(array, array(INFOS, told[0]) if told else None)
+        return _Episode(array, array(told) if told else None)
 
     return episode
 
@@ -282,9 +284,10 @@ def _arrow_reader(data_format: str, folder: Path, source: str) -> Callable[[int]
             raise DatasetError(f"{source}, episode {index}: holds no {', '.join(missing)}; the file is incomplete.")
         columns = {name: pyarrow.dataset.field(name) for name in EPISODE_KEYS}
         infos = files.schema.field(INFOS).type if INFOS in files.schema.names else pyarrow.struct([])
-        told = [name for name in SUCCESSES if pyarrow.types.is_struct(infos) and infos.get_field_index(name) >= 0][:1]
+        names = SUCCESS if pyarrow.types.is_struct(infos) else ()
+        told = next((name for name in names if infos.get_field_index(name) >= 0), None)
         if told:
-            columns[INFOS] = pyarrow.dataset.field(INFOS, told[0])
+            columns[INFOS] = pyarrow.dataset.field(INFOS, told)
         table = files.to_table(columns=columns)
         table.validate(full=True)
 

@@ -115,7 +115,7 @@ def _n_bytes(observations: Any) -> int:
 def _episode_buffer(episode: RecordedEpisode) -> EpisodeBuffer:
     ends = np.zeros((2, len(episode.actions)), dtype=bool)
     ends[:, -1] = episode.terminated, episode.truncated
-    told = [False, *episode.reported]  # as many as observations
+    told = [False, *map(bool, episode.reported)]  # as many as observations; the last one tells of the episode
     return EpisodeBuffer(
         seed=episode.seed,
         observations=stack_observations(episode.observations),
@@ -123,7 +123,7 @@ def _episode_buffer(episode: RecordedEpisode) -> EpisodeBuffer:
         rewards=np.asarray(episode.rewards, dtype=np.float64),
         terminations=ends[0],
         truncations=ends[1],
-        infos=None if None in told else {"is_success": np.array(told)},
+        infos=None if episode.success is None else {"is_success": np.array(told)},
     )
 
 

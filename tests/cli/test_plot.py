@@ -2,24 +2,9 @@
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from torch.utils.tensorboard import SummaryWriter
 
 from sb3_dtfm.cli.plot import load_evaluations, plot_learning_curve
-
-
-@pytest.fixture
-def figures(monkeypatch) -> list[Figure]:
-    """The figures that are saved, to look into."""
-    saved: list[Figure] = []
-    save = Figure.savefig
-
-    def savefig(figure: Figure, *args, **kwargs) -> None:
-        saved.append(figure)
-        save(figure, *args, **kwargs)
-
-    monkeypatch.setattr(Figure, "savefig", savefig)
-    return saved
 
 
 @pytest.mark.parametrize("n_logged", [1, 2])

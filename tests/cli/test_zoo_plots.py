@@ -31,19 +31,9 @@ def logs(minari_folder, tmp_path_factory) -> Path:
     return place
 
 
-@pytest.fixture
-def figures(logs, monkeypatch) -> list[Figure]:
-    """The figures that are saved in a folder with those runs, to look into."""
+@pytest.fixture(autouse=True)
+def beside_the_runs(logs, monkeypatch) -> None:
     monkeypatch.chdir(logs)
-    saved: list[Figure] = []
-    save = Figure.savefig
-
-    def savefig(figure: Figure, *args, **kwargs) -> None:
-        saved.append(figure)
-        save(figure, *args, **kwargs)
-
-    monkeypatch.setattr(Figure, "savefig", savefig)
-    return saved
 
 
 def curves(figure: Figure) -> dict[str, tuple[list[float], list[float]]]:

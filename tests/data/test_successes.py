@@ -73,8 +73,9 @@ def test_infos_of_steps_and_episodes_tell():
         [steps(False, True), steps(True, False), make_trajectory(3, actions=np.zeros((3, 2)), success=True)]
     )
     assert buffer.successes.tolist() == [1, 0, 1]
-    buffer = load_dataset([steps(True), steps(None), [step[:5] for step in steps(True)]])
-    assert np.isnan(buffer.successes).tolist() == [False, True, True]
+    silent = [[step[:5] for step in steps(True)], [(*step[:5], np.zeros(3)) for step in steps(True)]]
+    buffer = load_dataset([steps(True), steps(None), *silent])
+    assert np.isnan(buffer.successes).tolist() == [False, True, True, True]
 
 
 @pytest.mark.parametrize(
@@ -129,6 +130,10 @@ def test_a_choice_that_cannot_be_made_is_refused():
         load_dataset(arrays(success=np.zeros(4)))
     with pytest.raises(DatasetError, match=r"arrays: success hold 2.* 0 and 1 are accepted"):
         load_dataset(arrays(success=np.full(3, 2)))
+    episode = {"obs": np.zeros((4, 3)), "acts": np.zeros((4, 2)), "rews": np.zeros(4)}
+    for told, message in ((np.ones(3), r"success have shape \(3,\), expected \(4,\)"), (0.5, "success hold 0.5")):
+        with pytest.raises(DatasetError, match=f"episode 0: {message}"):
+            load_dataset([{**episode, "success": told}])
     halves = [make_trajectory(3, success=True), make_trajectory(4)]
     with pytest.raises(DatasetError, match="of 1 of 2 episodes the data do not tell"):
         TrajectoryBuffer.from_trajectories(halves, ACTION_SPACE).best(success_only=True)
@@ -148,7 +153,7 @@ class Told(gym.Env):
     def step(self, action):
         self.n_steps += 1
         done = self.n_steps == 3
-        return self.drawn.copy(), 0.0, done, False, {"is_success": done and self.drawn[0] == 1.0}
+        return self.drawn.copy(), 0.0, done, False, {"is_success": self.drawn[0] == 1.0} if done else {}
 
 
 gym.register("Told-v0", entry_point=Told)
