@@ -24,7 +24,7 @@ help:
 	@echo "make audit    ask for known vulnerabilities of the pinned versions; needs the network"
 	@echo "make licences write the table of docs/licences.md anew"
 	@echo "make docs     the site, into build/site"
-	@echo "make dist     source distribution and wheel, into dist/, as PyPI would take them"
+	@echo "make dist     source distribution and wheel, into dist/; for PyPI with ADDRESS=https://github.com/OWNER/sb3_dtfm"
 	@echo "make format   rewrite the sources in the project's format"
 	@echo "make lint     check format and style"
 	@echo "make type     check types"
@@ -97,9 +97,11 @@ docs: $(TOOLS)/installed linked
 	NO_MKDOCS_2_WARNING=1 $(TOOLS)/bin/mkdocs build --strict
 
 # The wheel is built from the source distribution, so that both are known to be whole.
+# PyPI needs the repository's address: make dist ADDRESS=https://github.com/OWNER/sb3_dtfm
 dist: $(TOOLS)/installed
-	rm -rf dist build/lib
-	$(TOOLS)/bin/python -m build --outdir dist
+	rm -rf dist build/lib build/release
+	$(if $(ADDRESS),$(BIN)/python docs/addresses.py $(ADDRESS) build/release)
+	$(TOOLS)/bin/python -m build --outdir dist $(if $(ADDRESS),build/release,.)
 	$(TOOLS)/bin/twine check --strict dist/*
 
 $(TOOLS)/installed: Makefile | install

@@ -207,8 +207,10 @@ def understand(words: list[str]) -> None:
             patch.syspath_prepend(str(script.parent))
             parse_only(lambda: runpy.run_path(str(script), run_name="__main__"))
     elif program == "make":
-        targets = re.findall(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)[0].split()
-        assert set(arguments) <= set(targets)
+        makefile = (ROOT / "Makefile").read_text()
+        targets = re.findall(r"^\.PHONY: (.*)$", makefile, re.MULTILINE)[0].split()
+        assert {word for word in arguments if "=" not in word} <= set(targets)
+        assert all(f"$({word.partition('=')[0]})" in makefile for word in arguments if "=" in word)
     else:
         assert words[:4] == ["pip", "install", "-c", "constraints.txt"], f"{program}: no command that this test knows"
         extras = {extra for word in words for extra in re.findall(r"^\.\[(.*)\]$", word)}
