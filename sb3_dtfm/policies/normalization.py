@@ -96,7 +96,6 @@ class Normalization(nn.Module):
         :param windows: tensors; observations and returns-to-go as the environment gives them
         :return: observations normalised and clipped, returns-to-go scaled to about 1 and clipped, the others as they are
         """
-        observations = (windows.observations - self.observation_mean) / self.observation_std
         returns_to_go = windows.returns_to_go
         if self.return_to_go_range is not None:
             low, high = self.return_to_go_range[:, windows.timesteps.clamp(max=self.max_timestep - 1)]
@@ -105,9 +104,14 @@ class Normalization(nn.Module):
             remaining = (self.max_timestep - windows.timesteps).clamp(min=1)
             returns_to_go = returns_to_go * (self.max_timestep / remaining)
         return windows._replace(
-            observations=observations.clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP) * self.observation_gain,
+            observations=self.scale_observation(windows.observations),
             returns_to_go=(returns_to_go / self.return_scale).clamp(-RETURN_TO_GO_CLIP, RETURN_TO_GO_CLIP),
         )
+
+    def scale_observation(self, observations: th.Tensor) -> th.Tensor:
+        """Normalised and clipped, (..., O)."""
+        scaled = (observations - self.observation_mean) / self.observation_std
+        return scaled.clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP) * self.observation_gain
 
     def scale_action(self, action: Any) -> Any:
         """From the environment's range to [-1, 1], (..., A)."""

@@ -26,12 +26,26 @@ from sb3_dtfm.arguments import (
     with_nearest,
 )
 from sb3_dtfm.heads import ActionHead
+from sb3_dtfm.heads.base import NOISE_ROWS
 from sb3_dtfm.networks.cpu import hand_out, take_up
 from sb3_dtfm.networks.trunk import SequenceTrunk
+from sb3_dtfm.policies.critic import Critic
 from sb3_dtfm.policies.memory import RememberedContext
 from sb3_dtfm.policies.normalization import Normalization
-from sb3_dtfm.windows import Context, Windows, check_context, empty_context, push, restarts, unpack_observation, with_plan
+from sb3_dtfm.windows import (
+    Context,
+    Transitions,
+    Windows,
+    check_context,
+    empty_context,
+    push,
+    restarts,
+    unpack_observation,
+    with_plan,
+)
 
+# How far apart in the noise table the candidates' rows lie, and those that chance chooses among them by: no divisor of its length.
+CANDIDATE_STRIDE, CHOICE_STRIDE, CHOICE_START = 97, 31, 513
 ACCEPTED: dict[str, Rule] = {
     "context_length": COUNT,
     "max_timestep": COUNT,
@@ -48,6 +62,9 @@ ACCEPTED: dict[str, Rule] = {
     "film_return_to_go": BOOLEAN,
     "calm_units": BOOLEAN,
     "kv_cache": BOOLEAN,
+    "critic_steps": Number(low=0, whole=True),
+    "gamma": PROBABILITY_BELOW_1,
+    "expectile": Number(low=0.5, high=1, below_high=True),
 }
 # What the algorithm gives to the policy by itself; everything else is for `policy_kwargs`.
 FROM_ALGORITHM = ("context_length", "max_timestep", "weight_decay", "ema", "seed")
@@ -95,6 +112,14 @@ class SequencePolicy(BasePolicy):
     :param film_return_to_go: let the return-to-go scale and shift what each block of the trunk gets, besides being a token
     :param calm_units: scale observations by what calm episodes spread, for data in which some agents' spread far wider; see
         :meth:`EpisodeTable.statistics`
+    :param critic_steps: with each gradient step, how many a critic takes that learns what actions are worth, so that the best
+        of several can be taken, see :class:`~sb3_dtfm.policies.critic.Critic`; trunk and head learn as without. It needs a
+        head that draws; 0 for no critic
+    :param gamma: discount of a step for the critic
+    :param expectile: of the critic
+    :param n_candidates: actions, or chunks, that are drawn each time, of which the critic has one taken; 1 asks no critic
+    :param temperature: how much chance that choice leaves, in units of how far actions' values spread in the data; 0 takes
+        the most valuable one
     :param ema: keep an exponential moving average of the weights and act with it
     :param kv_cache: act on the keys and values kept of earlier steps instead of recomputing the window: two to three times
         faster, and equal until the window slides (see :meth:`SequenceTrunk.extend`)
@@ -128,6 +153,11 @@ class SequencePolicy(BasePolicy):
         average_return_to_go: bool = False,
         film_return_to_go: bool = False,
         calm_units: bool = False,
+        critic_steps: int = 0,
+        gamma: float = 0.99,
+        expectile: float = 0.7,
+        n_candidates: int = 1,
+        temperature: float = 0.1,
         ema: bool = False,
         kv_cache: bool = False,
         seed: int | None = None,
@@ -150,6 +180,7 @@ class SequencePolicy(BasePolicy):
             )
         arguments.update(check_arguments(arguments, self._acting_rules()))
         self.n_action_steps = arguments["n_action_steps"]
+        self.n_candidates, self.temperature = arguments["n_candidates"], arguments["temperature"]
         self._constructor_arguments = {**arguments, **self.head_class.options(), **head_options}
         self.seed = seed
         self.observation_dim = int(observation_space["observation"].shape[0])  # type: ignore[index]
@@ -164,6 +195,17 @@ class SequencePolicy(BasePolicy):
         self.optimizer = self._make_optimizer(lr_schedule(1.0))
         generator = th.Generator().manual_seed(0 if seed is None else seed)
         self.register_buffer("noise_table", self.network.head.deterministic_noise(generator))
+        self.gamma, self.critic_steps = gamma, arguments["critic_steps"]
+        self.n_valued = self.n_action_steps  # actions that the critic values together: those that are carried out
+        self.critic: Critic | None = None
+        if self.critic_steps:  # made last: the weights of all else are what they are without
+            if self.network.head.noise_dim == 0:
+                raise ValueError(
+                    f"critic_steps={critic_steps}: the critic has nothing to choose among: {self.head_class.algorithm} makes one action of what it "
+                    "sees, where DTFM draws."
+                )
+            self.critic = Critic(self.observation_dim, self.n_valued * self.action_dim, expectile=expectile)
+        self._check_candidates(self.n_candidates)
         self._acting_generator: th.Generator | None = None
         self._remembered = RememberedContext()
 
@@ -413,9 +455,60 @@ class SequencePolicy(BasePolicy):
             hidden = hidden[th.from_numpy(due).to(device)]
         else:
             hidden = self.hidden_states(network, windows, last_only=True).squeeze(1)
-        noise = self._acting_noise(context.timesteps[due, -1] + context.episode_keys[due], deterministic).to(device)
-        actions = network.head(hidden, noise).clamp(-1.0, 1.0)
+        rows = context.timesteps[due, -1] + context.episode_keys[due]
+        if self.n_candidates == 1:
+            noise = self._acting_noise(rows, deterministic).to(device)
+            actions = network.head(hidden, noise).clamp(-1.0, 1.0)
+        else:
+            observations = th.from_numpy(context.observations[due, -1]).to(device)
+            candidates, chosen = self._draw_candidates(hidden, observations, rows, deterministic)
+            actions = candidates[th.arange(len(chosen), device=device), chosen]
         return actions.cpu().numpy().reshape(-1, self.chunk_size, self.action_dim), keys_values
+
+    def _draw_candidates(
+        self, hidden: th.Tensor, observations: th.Tensor, rows: np.ndarray, deterministic: bool
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """
+        Several draws from the head, and which of them the critic has taken.
+
+        :param hidden: (b, D)
+        :param observations: (b, O) as the environment gives them
+        :param rows: (b,) of the noise table; the first candidate's are these
+        :return: (b, N, H A) in [-1, 1], and (b,) int64
+        """
+        assert self.critic is not None
+        n, turns = self.n_candidates, np.arange(self.n_candidates)
+        noise = self._acting_noise((rows[:, None] + CANDIDATE_STRIDE * turns).ravel(), deterministic).to(hidden.device)
+        candidates = self.acting_network.head(hidden.repeat_interleave(n, dim=0), noise).clamp(-1.0, 1.0)
+        candidates = candidates.view(len(hidden), n, -1)
+        chance = self._acting_noise((rows[:, None] + CHOICE_START + CHOICE_STRIDE * turns).ravel(), deterministic)
+        uniform = th.special.ndtr(chance[:, 0]).clamp(1e-6, 1 - 1e-6).view(len(hidden), n).to(hidden.device)
+        states = self.normalization.scale_observation(observations).unsqueeze(1).expand(-1, n, -1)
+        values = self.critic(states, candidates[..., : self.n_valued * self.action_dim])
+        return candidates, self.critic.choose(values, self.temperature, uniform)
+
+    def guided_share(self, batch: Windows, generator: th.Generator) -> th.Tensor:
+        """
+        How often the critic has another candidate taken than the first one, at the newest steps of windows.
+
+        :param batch: windows of a buffer
+        :param generator: decides which rows of the noise table
+        """
+        self.set_training_mode(False)
+        with th.no_grad():
+            hidden = self.hidden_states(self.acting_network, self.scaled_windows(batch), last_only=True).squeeze(1)
+            rows = th.randint(NOISE_ROWS, (len(hidden),), generator=generator, device=generator.device).cpu().numpy()
+            _, chosen = self._draw_candidates(hidden, batch.observations[:, -1], rows, deterministic=True)
+            return (chosen != 0).float().mean()
+
+    def scaled_transitions(self, batch: Transitions) -> Transitions:
+        """Those of a buffer as the critic takes them: observations normalised, actions in [-1, 1]."""
+        actions = batch.actions.view(len(batch.actions), -1, self.action_dim)
+        return batch._replace(
+            observations=self.normalization.scale_observation(batch.observations),
+            next_observations=self.normalization.scale_observation(batch.next_observations),
+            actions=self.normalization.scale_action(actions).flatten(1),
+        )
 
     def _extend(self, windows: Windows, kept: np.ndarray) -> tuple[th.Tensor, np.ndarray]:
         """
@@ -483,7 +576,18 @@ class SequencePolicy(BasePolicy):
 
     def _acting_rules(self) -> dict[str, Rule]:
         """The policy's own ways of acting; the others are the head's."""
-        return {"kv_cache": BOOLEAN, "n_action_steps": Number(low=1, high=self.chunk_size, whole=True)}
+        return {
+            "kv_cache": BOOLEAN,
+            "n_action_steps": Number(low=1, high=self.chunk_size, whole=True),
+            "n_candidates": Number(low=1, high=NOISE_ROWS, whole=True),
+            "temperature": NOT_NEGATIVE,
+        }
+
+    def _check_candidates(self, n_candidates: int) -> None:
+        if n_candidates > 1 and self.critic is None:
+            raise ValueError(
+                f"n_candidates={n_candidates} needs a model that was trained with policy_kwargs=dict(critic_steps=...), above 0."
+            )
 
     def set_acting(self, **settings: Any) -> None:
         """
@@ -498,6 +602,7 @@ class SequencePolicy(BasePolicy):
             raise ValueError(f"{with_nearest(unknown, accepted)}: no way of acting; accepted are {', '.join(accepted)}.")
         settings = {**self.acting_settings(), **settings}
         own = check_arguments(settings, self._acting_rules())
+        self._check_candidates(own["n_candidates"])
         heads = self.network.head.check_acting(**{name: settings[name] for name in self.network.head.acting_choices})
         for name, value in own.items():
             setattr(self, name, value)

@@ -1,0 +1,84 @@
+"""
+A goal that no single episode reaches from the start: parts of random walks have to be put together.
+
+Balls are pushed about a maze at random for a while, each from a cell of its own. One that comes upon the goal is rewarded,
+and none of those that begin where a model will have to begin gets there.
+
+    python studies/random_walks.py record
+    sb3-dtfm benchmark $(python studies/random_walks.py arguments) --seeds 0 1 2
+"""
+
+import argparse
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_dtfm.envs import register_gymnasium_robotics
+from sb3_dtfm.recording.agent import episode_seeds
+from sb3_dtfm.recording.episodes import EpisodeRecorder, run_episodes
+from sb3_dtfm.recording.minari import check_dataset_id, write_minari
+
+register_gymnasium_robotics()
+ENV_ID = "PointMaze_UMaze-v3"
+START, FREE, GOAL, WALL = "r", 0, "g", 1
+MAZE = [
+    [WALL, WALL, WALL, WALL, WALL],
+    [WALL, START, FREE, FREE, WALL],
+    [WALL, WALL, WALL, FREE, WALL],
+    [WALL, GOAL, FREE, FREE, WALL],
+    [WALL, WALL, WALL, WALL, WALL],
+]
+# Walks begin anywhere.
+WALKED = [[START if cell == FREE else cell for cell in row] for row in MAZE]
+DATASET_ID = "local/pointmaze/random-walks-v0"
+N_STEPS = 50  # of a walk
+MAX_STEPS = 300  # of an evaluation
+TURN = 0.15  # probability with which a walk takes another direction at a step
+
+
+class RandomWalk:
+    """Pushes in one direction for a while, then in another."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng, self._push = rng, np.zeros(2)
+
+    def act(self) -> np.ndarray:
+        if not self._push.any() or self._rng.random() < TURN:
+            self._push = self._rng.uniform(-1.0, 1.0, 2)
+        return np.clip(self._push + self._rng.normal(0.0, 0.2, 2), -1.0, 1.0).astype(np.float32)
+
+
+def record(n_episodes: int) -> None:
+    """Write the dataset, and tell whether a walk from the start reached the goal."""
+    check_dataset_id(DATASET_ID, overwrite=True)
+    env = gym.make(ENV_ID, maze_map=WALKED, continuing_task=False, max_episode_steps=N_STEPS)
+    walks = [RandomWalk(np.random.default_rng(number)) for number in range(n_episodes)]
+
+    def act(observations: dict[str, np.ndarray], _: np.ndarray, numbers: list[int]) -> np.ndarray:
+        return np.stack([walks[number].act() for number in numbers])
+
+    episodes = run_episodes([EpisodeRecorder(env)], act, episode_seeds(0, n_episodes))
+    dataset = write_minari(DATASET_ID, episodes, env, {"algorithm_name": "pushed at random"})
+    walked = [(episode.observations["achieved_goal"], episode.terminations[-1]) for episode in dataset.iterate_episodes()]
+    from_start = [reached for path, reached in walked if path[0][0] < 0 < path[0][1] - 0.5]
+    print(
+        f"{dataset.id}: {n_episodes} walks, {dataset.total_steps} steps, {np.mean([reached for _, reached in walked]):.0%} come "
+        f"upon the goal; of the {len(from_start)} that began at the start, {sum(from_start)}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("record", "arguments"))
+    parser.add_argument("--episodes", type=int, default=1000)
+    options = parser.parse_args()
+    if options.what == "record":
+        record(options.episodes)
+    else:
+        env_kwargs = [f"maze_map:{MAZE!r}".replace(" ", ""), "continuing_task:False", f"max_episode_steps:{MAX_STEPS}"]
+        data = ["--dataset", f"{ENV_ID}={DATASET_ID}", "--target-return", "1", "--fractions", "1.0"]
+        print(*data, "-n", "2000", "--label", "random-walks", "--env-kwargs", *env_kwargs)
+
+
+if __name__ == "__main__":
+    main()
