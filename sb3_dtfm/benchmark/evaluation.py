@@ -24,6 +24,7 @@ FINAL_STATES = 2_000_000
 # What a cell prints for the grid that reads its output: steps done, steps in all, what it is doing.
 PROGRESS = re.compile(r"step (\d+) of (\d+): (.*)\n")
 PROGRESS_INTERVAL = 0.5  # seconds
+TIMED_ACTIONS = 100
 
 
 class Episodes(NamedTuple):
@@ -118,6 +119,27 @@ def evaluate(
     return Episodes(all_returns, all_lengths, None if None in successes else successes)
 
 
+def action_ms(model: BaseAlgorithm, vec_env: VecEnv, seed: int) -> float:
+    """
+    Median milliseconds of :data:`TIMED_ACTIONS` actions in one environment, from the start of an episode.
+
+    :param model: acts deterministically
+    :param vec_env: environments in :class:`SeededEpisodes`, which all do what the first one is told
+    :param seed: of the episode
+    """
+    vec_env.env_method("set_episode_seeds", [seed])
+    observations, state, starts = vec_env.reset(), None, np.ones(1, bool)
+    times = []
+    for _ in range(TIMED_ACTIONS):
+        first = {key: value[:1] for key, value in observations.items()}  # type: ignore[union-attr]
+        start = time.perf_counter()
+        actions, state = model.predict(first, state, starts, deterministic=True)
+        times.append(time.perf_counter() - start)
+        observations, _, dones, _ = vec_env.step(np.repeat(actions, vec_env.num_envs, axis=0))
+        starts = dones[:1]
+    return 1e3 * float(np.median(times))
+
+
 class EvaluationCallback(BaseCallback):
     """
     Evaluate before the first gradient step, every `eval_freq` of them and after the last one, and write a row each time;
@@ -200,6 +222,7 @@ class EvaluationCallback(BaseCallback):
             n_solver_steps=acting.get("n_solver_steps"),
             wall_s=round(self._training_seconds, 3),
             steps_per_s=round(self.num_timesteps / self._training_seconds, 3),
+            action_ms=round(action_ms(self.model, self.vec_env, first), 3) if final else None,
             hardware=provenance.hardware(self.model.device),
         )
         write_row(self.rows, {**self.row, **evaluation})
