@@ -19,7 +19,8 @@ from sb3_dtfm.zoo.arguments import UsageError
 HERE = Path(__file__).parent
 PROFILE = "authors"  # what the rows call the peers' settings
 KINDS = ("gait", "hand", "arm")
-WORKERS = ("d3rlpy", "robomimic")
+# Name: the module that its environment runs.
+WORKERS = {"d3rlpy": "peers.worker_d3rlpy", "robomimic": "peers.worker_robomimic"}
 
 
 class Data(NamedTuple):
@@ -182,7 +183,7 @@ def run_peer(
     budget = budget_of(data, peer, options)
     python = Path(getattr(options, f"{peer.worker}_python"))
     vec_env = make_seeded_envs(data.task, data.settings(), options.n_eval_envs)
-    with PeerProcess(python, f"peers.worker_{peer.worker}", log) as process, tempfile.TemporaryDirectory() as folder:
+    with PeerProcess(python, WORKERS[peer.worker], log) as process, tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "episodes.npz"
         export(data, peer, path)
         training = process.train(
