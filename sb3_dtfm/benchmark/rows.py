@@ -18,8 +18,8 @@ KEYS: dict[str, tuple[type, ...]] = {
     **dict.fromkeys(("solver", "commit"), (str, type(None))),
     **dict.fromkeys(("versions", "hardware", "settings", "data"), (dict,)),
 }
-# Of later rows: what the ones before do not tell.
-OPTIONAL_KEYS: dict[str, tuple[type, ...]] = {"action_ms": (float, int, type(None))}
+# What earlier rows do not tell.
+OPTIONAL_KEYS: dict[str, tuple[type, ...]] = {"action_ms": (float, int)}
 EPISODE_KEYS: dict[str, tuple[type, ...]] = {"returns": (float, int), "lengths": (float, int), "successes": (bool,)}
 
 Row = dict[str, Any]

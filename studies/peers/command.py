@@ -210,7 +210,6 @@ def main(argv: Sequence[str]) -> None:
     check_workers(peers, options)
     names = choose(options.data, list(known_data), "--data")
     chosen = [known_data[name] for name in names if ready(known_data[name], asked_for=options.data is not None)]
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     n_left = 0
     for seed in dict.fromkeys(options.seeds):  # outermost: a run that is cut short has seen all data
         for data in chosen:
@@ -228,6 +227,7 @@ def run() -> None:
 
     :raises SystemExit: as :func:`main`, and with a message for a mistake of the user's
     """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         main(sys.argv[1:])
     except KeyboardInterrupt:

@@ -50,16 +50,20 @@ class PeerProcess:
         self.versions: dict[str, str] = {}
         paths = [str(STUDIES), *filter(None, [os.environ.get("PYTHONPATH")])]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
-        with log.open("w") as errors:
+        answers, told = os.pipe()
+        with log.open("w") as said:
             # A session of its own: Ctrl-C is ours to handle.
             self._process = subprocess.Popen(
-                [str(python), "-m", module],
+                [str(python), "-m", module, str(told)],
                 stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=errors,
+                stdout=said,
+                stderr=said,
+                pass_fds=(told,),
                 env=environment,
                 start_new_session=True,
             )
+        os.close(told)
+        self._answers = os.fdopen(answers, "rb")
 
     def __enter__(self) -> "PeerProcess":
         return self
@@ -74,7 +78,7 @@ class PeerProcess:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._process.stdout.close()
+        self._answers.close()
 
     def train(
         self,
@@ -131,7 +135,7 @@ class PeerProcess:
 
     def action_ms(self) -> float:
         """
-        Median milliseconds of an action in one environment, of all so far, without the way through the pipe.
+        Mean milliseconds of an action in one environment, of all so far, without the way through the pipe.
 
         :raises PeerError: it has ended
         """
@@ -146,7 +150,7 @@ class PeerProcess:
 
     def _receive(self) -> Message:
         try:
-            return receive(self._process.stdout)
+            return receive(self._answers)
         except EOFError:
             raise self._ended() from None
 

@@ -185,39 +185,39 @@ def _train(job: dict[str, Any], make: MakeLearner, dataset: Dataset, stream: Bin
     return learner
 
 
-def _act(learner: Learner, dataset: Dataset, stdin: BinaryIO, stdout: BinaryIO) -> None:
+def _act(learner: Learner, dataset: Dataset, questions: BinaryIO, answers: BinaryIO) -> None:
     """Answer with actions until nobody asks."""
     actors: list[Callable[[np.ndarray, float, bool], np.ndarray]] = []
     times: list[float] = []
     while True:
-        message = receive(stdin)
+        message = receive(questions)
         if message.what == "timing":
-            send(stdout, "timing", action_ms=float(np.median(times)) * 1e3)
+            send(answers, "timing", action_ms=float(np.mean(times)) * 1e3)
             continue
-        questions = [message.arrays[name] for name in ("observations", "returns_to_go", "starts")]
-        actors += [learner.actor() for _ in range(len(questions[0]) - len(actors))]
+        asked_of = [message.arrays[name] for name in ("observations", "returns_to_go", "starts")]
+        actors += [learner.actor() for _ in range(len(asked_of[0]) - len(actors))]
         actions = []
-        for act, observation, return_to_go, start in zip(actors, *questions, strict=False):
+        for act, observation, return_to_go, start in zip(actors, *asked_of, strict=False):
             asked = time.perf_counter()
             actions.append(act(observation, float(return_to_go), bool(start)))
             times.append(time.perf_counter() - asked)
-        send(stdout, "actions", {"actions": dataset.to_environment(np.stack(actions))})
+        send(answers, "actions", {"actions": dataset.to_environment(np.stack(actions))})
 
 
 def serve(make: MakeLearner, packages: tuple[str, ...]) -> None:
     """
-    Train as asked for and act, until the other side is gone: what a worker's main is.
+    Train as asked for and act, until the other side is gone: what a worker's main is. It is asked on the standard input and
+    answers into the file descriptor that its argument names, since libraries print, some as they are imported.
 
     :param make: makes the peer
     :param packages: whose versions are told
     """
-    stdin, stdout = sys.stdin.buffer, os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what libraries print goes to the log
-    job = receive(stdin).values
-    send(stdout, "ready", versions={name: metadata.version(name) for name in packages})
+    questions, answers = sys.stdin.buffer, os.fdopen(int(sys.argv[1]), "wb")
+    job = receive(questions).values
+    send(answers, "ready", versions={name: metadata.version(name) for name in packages})
     dataset = read_dataset(job["dataset"])
-    learner = _train(job, make, dataset, stdout)
+    learner = _train(job, make, dataset, answers)
     try:
-        _act(learner, dataset, stdin, stdout)
+        _act(learner, dataset, questions, answers)
     except EOFError:
         return
