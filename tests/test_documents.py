@@ -208,11 +208,22 @@ def understand(words: list[str]) -> None:
             parse_only(lambda: runpy.run_path(str(script), run_name="__main__"))
     elif program == "make":
         targets = re.findall(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)[0].split()
-        assert set(arguments) <= set(targets)
+        assert {word for word in arguments if "=" not in word} <= set(targets)
+        for name, _, value in (word.partition("=") for word in arguments if "=" in word):
+            assert name == "ARGUMENTS", f"{name}: `make peers` knows ARGUMENTS alone"
+            understand_peers(value)
     else:
         assert words[:4] == ["pip", "install", "-c", "constraints.txt"], f"{program}: no command that this test knows"
         extras = {extra for word in words for extra in re.findall(r"^\.\[(.*)\]$", word)}
         assert extras <= set(metadata("sb3-dtfm").get_all("Provides-Extra"))
+
+
+def understand_peers(arguments: str) -> None:
+    """What `make peers` passes on."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "studies"))
+        command = importlib.import_module("peers.command")
+    command.parse_arguments(shlex.split(arguments))
 
 
 @pytest.mark.parametrize("page", pages_with(SHELL, "", "parse", "slow"))

@@ -56,12 +56,20 @@ class Data(NamedTuple):
     gym_packages: list[str] = []  # noqa: RUF012
     recorded_from: str | None = None
 
+    @property
+    def our_steps(self) -> int:
+        """Gradient steps of DT and DTFM."""
+        return int(self._our_settings()["n_timesteps"])
+
     def settings(self) -> dict[str, Any]:
         """What our own runs are told of data and environment."""
-        task = Task(self.task, self.dataset, self.target_return, self.recorded_from)
-        found = task_settings(self.profile, "dt", task, self.fraction, self.n_timesteps, self.params)
+        found = self._our_settings()
         names = ("dataset", "dataset_kwargs", "dataset_fraction", "dataset_seed", "env_wrapper")
         return {name: found[name] for name in names if name in found}
+
+    def _our_settings(self) -> dict[str, Any]:
+        task = Task(self.task, self.dataset, self.target_return, self.recorded_from)
+        return task_settings(self.profile, "dt", task, self.fraction, self.n_timesteps, self.params)
 
 
 class Peer(NamedTuple):

@@ -138,9 +138,8 @@ def run_ours(data: Data, algos: Sequence[str], seed: int, options: argparse.Name
         command = ["--datasets", file.name, "--algo", *algos, "--fractions", str(data.fraction), "--seeds", str(seed)]
         command += ["--profile", data.profile, "--label", label, "--device", "cpu", "-o", options.results]
         command += ["-f", options.log_folder, "--final-episodes", str(options.final_episodes), "--eval-episodes", "10"]
-        command += ["--n-eval-envs", str(options.n_eval_envs)]
+        command += ["--n-eval-envs", str(options.n_eval_envs), "-n", str(data.our_steps), "--eval-freq", str(data.our_steps)]
         command += ["--gym-packages", *data.gym_packages] if data.gym_packages else []
-        command += ["-n", str(data.n_timesteps)] if data.n_timesteps else []
         command += ["-params", *(f"{key}:{value!r}" for key, value in data.params.items())] if data.params else []
         try:
             benchmark.main(command)

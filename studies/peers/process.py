@@ -135,7 +135,7 @@ class PeerProcess:
 
     def action_ms(self) -> float:
         """
-        Mean milliseconds of an action in one environment, of all so far, without the way through the pipe.
+        Milliseconds of an action in one environment, of all so far, without the way through the pipe.
 
         :raises PeerError: it has ended
         """

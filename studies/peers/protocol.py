@@ -19,6 +19,7 @@ import numpy as np
 PROGRESS_INTERVAL = 0.5  # seconds
 # What a peer's speed is measured by before its training is planned.
 TRIAL_SECONDS, TRIAL_STEPS, FIRST_STEPS = 10.0, 500, 10
+TIMED_ACTIONS = 16
 
 
 class Message(NamedTuple):
@@ -185,6 +186,12 @@ def _train(job: dict[str, Any], make: MakeLearner, dataset: Dataset, stream: Bin
     return learner
 
 
+def _milliseconds(times: list[float]) -> float:
+    """As `sb3_dtfm.benchmark.evaluation.action_ms`: the median of the means over blocks."""
+    n_blocks = max(1, len(times) // TIMED_ACTIONS)
+    return 1e3 * float(np.median([np.mean(block) for block in np.array_split(times, n_blocks)]))
+
+
 def _act(learner: Learner, dataset: Dataset, questions: BinaryIO, answers: BinaryIO) -> None:
     """Answer with actions until nobody asks."""
     actors: list[Callable[[np.ndarray, float, bool], np.ndarray]] = []
@@ -192,7 +199,7 @@ def _act(learner: Learner, dataset: Dataset, questions: BinaryIO, answers: Binar
     while True:
         message = receive(questions)
         if message.what == "timing":
-            send(answers, "timing", action_ms=float(np.mean(times)) * 1e3)
+            send(answers, "timing", action_ms=_milliseconds(times))
             continue
         asked_of = [message.arrays[name] for name in ("observations", "returns_to_go", "starts")]
         actors += [learner.actor() for _ in range(len(asked_of[0]) - len(actors))]

@@ -113,7 +113,7 @@ def _optimizers(settings: dict[str, Any], fields: set[str], n_steps: int) -> dic
         return {"actor_optim_factory": d3rlpy.optimizers.AdamFactory(lr_scheduler_factory=schedule)}
     if "adamw" in settings:
         options = dict(settings["adamw"])
-        warmup = d3rlpy.optimizers.WarmupSchedulerFactory(options.pop("warmup_steps"))
+        warmup = d3rlpy.optimizers.WarmupSchedulerFactory(max(1, round(options.pop("warmup_share") * n_steps)))
         return {"optim_factory": d3rlpy.optimizers.AdamWFactory(lr_scheduler_factory=warmup, **options)}
     return {}
 
