@@ -121,7 +121,7 @@ def evaluate(
 
 def action_ms(model: BaseAlgorithm, vec_env: VecEnv, seed: int) -> float:
     """
-    Milliseconds of an action in one environment, from the start of an episode: the median of the means over blocks of actions.
+    Milliseconds of an action in one environment: the median of the means over blocks of actions, from an episode's start on.
 
     A mean, since of a chunk that is carried out only the first action takes time; a median, since other jobs interrupt.
 
