@@ -1,6 +1,7 @@
 """What `make peers` is to run: its data and its peers, from their YAML files, and a row for each peer's training."""
 
 import argparse
+import contextlib
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -191,7 +192,11 @@ def run_peer(
     budget = budget_of(data, peer, options)
     python = Path(getattr(options, f"{peer.worker}_python"))
     vec_env = make_seeded_envs(data.task, data.settings(), options.n_eval_envs)
-    with PeerProcess(python, WORKERS[peer.worker], log) as process, tempfile.TemporaryDirectory() as folder:
+    with (
+        contextlib.closing(vec_env),
+        PeerProcess(python, WORKERS[peer.worker], log) as process,
+        tempfile.TemporaryDirectory() as folder,
+    ):
         path = Path(folder) / "episodes.npz"
         export(data, peer, path)
         training = process.train(
@@ -201,7 +206,6 @@ def run_peer(
         n_steps = training.n_steps
         episodes = evaluate(process, vec_env, seeds, lambda n: say(n_steps, n_steps, f"evaluation {n}/{len(seeds)}"))
         action_ms = process.action_ms()
-    vec_env.close()
     return {
         **peer_cell(data, peer, seed, options.label)._asdict(),
         "settings": row_settings(data, peer, budget),

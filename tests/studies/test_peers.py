@@ -1,7 +1,9 @@
 """Peers learn from what ours learn from, act where ours act, and their rows are rows."""
 
 import io
+import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -127,6 +129,29 @@ def test_an_ended_peer_names_its_log_and_why(tmp_path, buffer):
         tiny_process(tmp_path) as process,
     ):
         process.train(tmp_path / "episodes.npz", {"fail": "no such layer"}, 0, 50, None)
+
+
+ENDLESS = """
+import sys
+from pathlib import Path
+sys.path.append("studies")
+from peers.process import PeerProcess
+folder = Path(sys.argv[1])
+with PeerProcess(Path(sys.executable), "tests.studies.tiny_worker", folder / "log") as process:
+    on_progress = lambda done, n_steps: print(done, flush=True)
+    process.train(folder / "episodes.npz", {"learning_rate": 0.1}, 0, 10**9, None, on_progress)
+"""
+
+
+def test_a_killed_command_takes_its_peer_along(tmp_path, buffer):
+    buffer.save(tmp_path / "episodes.npz")
+    with subprocess.Popen([sys.executable, "-c", ENDLESS, str(tmp_path)], stdout=subprocess.PIPE) as process:
+        assert int(process.stdout.readline()) > 0, "it is training"
+        process.kill()
+    end = time.monotonic() + 20.0
+    while "BrokenPipeError" not in (tmp_path / "log").read_text():
+        assert time.monotonic() < end, "it goes on without anybody to tell"
+        time.sleep(0.1)
 
 
 def command_line(tmp_path: Path, datasets: Path, *more: str) -> list[str]:
