@@ -1,11 +1,12 @@
 .DELETE_ON_ERROR:
-.PHONY: help install demo test test-all bench lowest highest audit licences docs dist format lint type linked clean
+.PHONY: help install demo test test-all bench peers lowest highest audit licences docs dist format lint type linked clean
 
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
-# d3rlpy needs another gymnasium.
+# d3rlpy needs another gymnasium, robomimic a torchvision.
 PEERS := .venv-peers
+ROBOMIMIC := .venv-robomimic
 # What looks at dependencies, makes the site and looks at what is published, apart from them.
 TOOLS := .venv-tools
 # Tests of each part that meets other packages.
@@ -20,6 +21,8 @@ help:
 	@echo "make test     the fast tests"
 	@echo "make test-all the slow tests too: kills, a million calls, several processes; half an hour on 2 cores"
 	@echo "make bench    DT and DTFM beside d3rlpy, training and acting: 15 minutes on 2 idle cores"
+	@echo "make peers    DT and DTFM beside d3rlpy's and robomimic's algorithms on studies/peers.yml: days on one core;"
+	@echo "              ARGUMENTS=\"--data can-few --seeds 0\" runs some of it, ARGUMENTS=--help says what there is"
 	@echo "make lowest   tests of each part with the lowest versions that pyproject.toml allows; make highest: the highest"
 	@echo "make audit    ask for known vulnerabilities of the pinned versions; needs the network"
 	@echo "make licences write the table of docs/licences.md anew"
@@ -72,6 +75,18 @@ $(PEERS)/installed: constraints.txt
 	rm -rf $(PEERS)
 	$(BIN)/python -m venv $(PEERS)
 	$(PEERS)/bin/pip install --disable-pip-version-check --quiet $$(grep '^torch==' constraints.txt) d3rlpy==2.8.1
+	@touch $@
+
+peers: install $(PEERS)/installed $(ROBOMIMIC)/installed
+	PYTHONPATH=studies $(BIN)/python -m peers $(ARGUMENTS)
+
+# What of robomimic learns from vectors needs no more than this; with its own requirements pip would take another torch.
+$(ROBOMIMIC)/installed: constraints.txt
+	rm -rf $(ROBOMIMIC)
+	$(BIN)/python -m venv $(ROBOMIMIC)
+	$(ROBOMIMIC)/bin/pip install --disable-pip-version-check --quiet $$(grep '^torch==' constraints.txt) numpy h5py matplotlib \
+		pillow six termcolor tqdm
+	$(ROBOMIMIC)/bin/pip install --disable-pip-version-check --quiet --no-deps robomimic==0.3.0 torchvision==0.28.0
 	@touch $@
 
 lowest: RESOLUTION := lowest-direct
@@ -130,4 +145,4 @@ linked:
 	@ln -s $(CURDIR)/envs $(CURDIR)/zoo_configs build/linked/sb3_dtfm/
 
 clean:
-	rm -rf $(VENV) $(PEERS) $(TOOLS) .venv-lowest .venv-highest build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(PEERS) $(ROBOMIMIC) $(TOOLS) .venv-lowest .venv-highest build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache

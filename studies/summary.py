@@ -7,7 +7,7 @@ The tables of results/*/README.md are what this prints, and results/README.md sa
 """
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -41,9 +41,16 @@ def median_steps(run: Run) -> str:
     return f"{median:g}" if np.isfinite(median) else NONE
 
 
+def milliseconds(runs: Sequence[Run]) -> str:
+    """Of an action in one environment, the mean over those runs that tell."""
+    told = [time for run in runs if (time := run.final.get("action_ms")) is not None]
+    return f"{np.mean(told):.1f}" if told else NONE
+
+
 def lines(folder: Path) -> Iterable[dict[str, str]]:
     """One for each label, task, share of the data and algorithm."""
-    for group in (group for study in read_studies([folder]) for group in study.groups):
+    groups = [group for study in read_studies([folder]) for group in study.groups]
+    for group in sorted(groups, key=lambda group: group.label):
         for (task, share, algo), runs in sorted(group.runs.items()):
             values = {
                 "late average": [measured(run, "late") for run in runs],
@@ -59,6 +66,7 @@ def lines(folder: Path) -> Iterable[dict[str, str]]:
                 "seeds": ", ".join(str(run.cell.seed) for run in runs),
                 **{name: NONE if set(each) == {NONE} else "; ".join(each) for name, each in values.items()},
                 "minutes": f"{np.mean([run.minutes for run in runs]):.1f}",
+                "ms an action": milliseconds(runs),
                 "commits": ", ".join(dict.fromkeys(run.commit for run in runs)),
             }
 

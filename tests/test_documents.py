@@ -210,11 +210,22 @@ def understand(words: list[str]) -> None:
         makefile = (ROOT / "Makefile").read_text()
         targets = re.findall(r"^\.PHONY: (.*)$", makefile, re.MULTILINE)[0].split()
         assert {word for word in arguments if "=" not in word} <= set(targets)
-        assert all(f"$({word.partition('=')[0]})" in makefile for word in arguments if "=" in word)
+        for name, _, value in (word.partition("=") for word in arguments if "=" in word):
+            assert f"$({name})" in makefile
+            if name == "ARGUMENTS":
+                understand_peers(value)
     else:
         assert words[:4] == ["pip", "install", "-c", "constraints.txt"], f"{program}: no command that this test knows"
         extras = {extra for word in words for extra in re.findall(r"^\.\[(.*)\]$", word)}
         assert extras <= set(metadata("sb3-dtfm").get_all("Provides-Extra"))
+
+
+def understand_peers(arguments: str) -> None:
+    """What `make peers` passes on."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "studies"))
+        command = importlib.import_module("peers.command")
+    command.parse_arguments(shlex.split(arguments))
 
 
 @pytest.mark.parametrize("page", pages_with(SHELL, "", "parse", "slow"))

@@ -24,6 +24,7 @@ FINAL_STATES = 2_000_000
 # What a cell prints for the grid that reads its output: steps done, steps in all, what it is doing.
 PROGRESS = re.compile(r"step (\d+) of (\d+): (.*)\n")
 PROGRESS_INTERVAL = 0.5  # seconds
+TIMED_BLOCKS, TIMED_ACTIONS = 8, 16
 
 
 class Episodes(NamedTuple):
@@ -118,6 +119,29 @@ def evaluate(
     return Episodes(all_returns, all_lengths, None if None in successes else successes)
 
 
+def action_ms(model: BaseAlgorithm, vec_env: VecEnv, seed: int) -> float:
+    """
+    Milliseconds of an action in one environment: the median of the means over blocks of actions, from an episode's start on.
+
+    A mean, since of a chunk that is carried out only the first action takes time; a median, since other jobs interrupt.
+
+    :param model: acts deterministically
+    :param vec_env: environments in :class:`SeededEpisodes`, which all do what the first one is told
+    :param seed: of the episode
+    """
+    vec_env.env_method("set_episode_seeds", [seed])
+    observations, state, starts = vec_env.reset(), None, np.ones(1, bool)
+    times = []
+    for _ in range(TIMED_BLOCKS * TIMED_ACTIONS):
+        first = {key: value[:1] for key, value in observations.items()}  # type: ignore[union-attr]
+        start = time.perf_counter()
+        actions, state = model.predict(first, state, starts, deterministic=True)
+        times.append(time.perf_counter() - start)
+        observations, _, dones, _ = vec_env.step(np.repeat(actions, vec_env.num_envs, axis=0))
+        starts = dones[:1]
+    return 1e3 * float(np.median(np.reshape(times, (TIMED_BLOCKS, TIMED_ACTIONS)).mean(axis=1)))
+
+
 class EvaluationCallback(BaseCallback):
     """
     Evaluate before the first gradient step, every `eval_freq` of them and after the last one, and write a row each time;
@@ -192,7 +216,7 @@ class EvaluationCallback(BaseCallback):
         seeds = range(first, first + n_episodes)
         episodes = evaluate(self.model, self.vec_env, seeds, lambda n_done: self._report(f"{what} {n_done}/{n_episodes}"))
         acting = self.model.policy.acting_settings()  # type: ignore[operator]
-        evaluation = dict(
+        evaluation: Row = dict(
             step=self.num_timesteps,
             final=final,
             **episodes._asdict(),
@@ -202,6 +226,8 @@ class EvaluationCallback(BaseCallback):
             steps_per_s=round(self.num_timesteps / self._training_seconds, 3),
             hardware=provenance.hardware(self.model.device),
         )
+        if final:
+            evaluation["action_ms"] = round(action_ms(self.model, self.vec_env, first), 3)
         write_row(self.rows, {**self.row, **evaluation})
         self._resumed = time.perf_counter()
 

@@ -18,6 +18,8 @@ KEYS: dict[str, tuple[type, ...]] = {
     **dict.fromkeys(("solver", "commit"), (str, type(None))),
     **dict.fromkeys(("versions", "hardware", "settings", "data"), (dict,)),
 }
+# What earlier rows do not tell.
+OPTIONAL_KEYS: dict[str, tuple[type, ...]] = {"action_ms": (float, int)}
 EPISODE_KEYS: dict[str, tuple[type, ...]] = {"returns": (float, int), "lengths": (float, int), "successes": (bool,)}
 
 Row = dict[str, Any]
@@ -75,13 +77,14 @@ def check_row(row: Any) -> Row:
     """
     if not isinstance(row, dict):
         raise RowError(f"holds a {type(row).__name__}, expected an object with the keys {', '.join(KEYS)}.")
-    missing, unknown = [key for key in KEYS if key not in row], sorted(set(row) - set(KEYS))
+    missing, unknown = [key for key in KEYS if key not in row], sorted(set(row) - set(KEYS) - set(OPTIONAL_KEYS))
     if missing or unknown:
         found = [f"lacks {', '.join(missing)}"] if missing else []
         found += [f"has the unknown {', '.join(unknown)}"] if unknown else []
         raise RowError(f"{' and '.join(found)}; expected are {', '.join(KEYS)}.")
-    for key, types in KEYS.items():
-        _check_type(f"{key} is", row[key], types)
+    for key, types in {**KEYS, **OPTIONAL_KEYS}.items():
+        if key in row:
+            _check_type(f"{key} is", row[key], types)
     episodes = {key: row[key] for key in EPISODE_KEYS if row[key] is not None}
     for key, values in episodes.items():
         for value in values:

@@ -1,5 +1,6 @@
 """Evaluation counts each initial state once, whatever the number of environments and the lengths of episodes."""
 
+import time
 from typing import Any
 
 import gymnasium as gym
@@ -17,11 +18,13 @@ from sb3_dtfm.benchmark.evaluation import (
     TRAINING_STATES,
     EvaluationCallback,
     SeededEpisodes,
+    action_ms,
     evaluate,
     make_seeded_envs,
 )
 from sb3_dtfm.benchmark.rows import Cell, read_rows
 from sb3_dtfm.benchmark.runner import CALLBACK
+from sb3_dtfm.envs import ReturnToGoWrapper
 from tests.conftest import TINY_FLOW_POLICY
 
 
@@ -89,6 +92,23 @@ def test_success_goes_by_the_name_that_gymnasium_robotics_has_for_it_too():
     assert evaluate(Idle(), vec_env(2, success_key="success"), [3, 4]).successes == [False, True]
 
 
+class Slow(Idle):
+    """Takes 20 ms for every fourth action, as if it planned four."""
+
+    def predict(self, observations, state=None, episode_start=None, deterministic=False):
+        if len(self.starts) % 4 == 0:
+            time.sleep(0.02)
+        return super().predict(observations["observation"], state, episode_start, deterministic)
+
+
+def test_an_action_is_timed_in_one_environment_and_on_the_average():
+    model = Slow()
+    envs = DummyVecEnv([lambda: SeededEpisodes(ReturnToGoWrapper(Countdown(), 0.0)) for _ in range(3)])
+    assert 5.0 <= action_ms(model, envs, seed=30) < 10.0
+    assert [len(starts) for starts in model.starts] == [1] * 128
+    assert np.flatnonzero(np.concatenate(model.starts)).tolist()[:2] == [0, 30], "the first episode is that of the seed"
+
+
 @pytest.fixture
 def row() -> dict[str, Any]:
     """What all rows of a run say: HalfCheetah in episodes of 5 steps."""
@@ -116,6 +136,7 @@ def test_rows_come_before_during_and_after_training_and_at_the_end_on_other_stat
     assert {(each["solver"], each["n_solver_steps"]) for each in rows} == {("heun", 4)}
     assert all(each["lengths"] == [5] * len(each["returns"]) and each["successes"] is None for each in rows)
     assert (rows[0]["steps_per_s"], rows[-1]["hardware"]["gpu"]) == (0.0, None)
+    assert [each.get("action_ms", 0.0) > 0.0 for each in rows] == [False] * 4 + [True]
     walls = [each["wall_s"] for each in rows]
     assert walls == sorted(walls)
     # The last two rows are of the same weights, on the states that their seeds give

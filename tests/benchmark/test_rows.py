@@ -10,9 +10,10 @@ from tests.benchmark.conftest import make_row
 
 def test_a_row_comes_back_as_it_was_written(tmp_path, row):
     other = make_row(seed=1, successes=None, solver=None, n_solver_steps=None, commit=None)
-    for each in (row, other):
+    timed = make_row(seed=2, action_ms=1.5)
+    for each in (row, other, timed):
         write_row(tmp_path / "a.jsonl", each)
-    assert read_rows(tmp_path / "a.jsonl") == [row, other]
+    assert read_rows(tmp_path / "a.jsonl") == [row, other, timed]
 
 
 def test_files_of_several_machines_merge_by_concatenation(tmp_path):
@@ -57,6 +58,7 @@ def test_two_results_of_one_evaluation_are_refused(tmp_path):
         ({"returns": [], "lengths": [], "successes": []}, "0 returns"),
         ({"returns": [1.0, "x", 1.0, 1.0]}, "returns holds 'x'"),
         ({"successes": [1, 1, 1, 1]}, "successes holds 1, expected bool"),
+        ({"action_ms": "fast"}, "action_ms is 'fast', expected float or int"),
         ({"speed": 3}, "unknown speed"),
     ],
 )

@@ -1,0 +1,51 @@
+"""
+What a study's runs had reached when those of another one, which need fewer minutes, were finished: same tasks, same data.
+
+    python studies/same_minutes.py results/one-token results/small --labels one-token ""
+
+A line for each task and algorithm: the means over the last three evaluations that were made within these minutes of
+training, seed by seed. The longer runs are cut short, so their learning rate had not come down yet.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from sb3_dtfm.benchmark.report.runs import Run, read_studies
+
+N_LAST = 3
+
+
+def runs_of(folder: Path, label: str) -> dict[tuple, list[Run]]:
+    """By task, share of the data and algorithm."""
+    groups = [group for study in read_studies([folder]) for group in study.groups if group.label == label]
+    return {cell: runs for group in groups for cell, runs in group.runs.items()}
+
+
+def reached(run: Run, minutes: float) -> str:
+    """Return, or success in percent, by then."""
+    rows = [row for row in run.evaluations if row["wall_s"] <= 60 * minutes][-N_LAST:]
+    if run.counts_success:
+        return f"{np.mean([row['successes'] for row in rows]):.0%}"
+    return f"{np.mean([row['returns'] for row in rows]):,.0f}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", nargs=2, type=Path, metavar=("QUICK", "SLOW"))
+    parser.add_argument("--labels", nargs=2, default=("", ""), metavar=("QUICK", "SLOW"))
+    arguments = parser.parse_args()
+    quick, slow = (runs_of(*which) for which in zip(arguments.folders, arguments.labels, strict=True))
+    print("| task | data | algorithm | minutes | whole, seed by seed | cut short |\n| --- | --- | --- | --- | --- | --- |")
+    for cell in sorted(quick.keys() & slow.keys()):
+        task, share, algo = cell
+        minutes = float(np.mean([run.minutes for run in quick[cell]]))
+        whole, cut = (
+            "; ".join(reached(run, limit) for run in runs) for runs, limit in ((quick[cell], np.inf), (slow[cell], minutes))
+        )
+        print(f"| {task} | {share:.0%} | {algo.upper()} | {minutes:.1f} | {whole} | {cut} |")
+
+
+if __name__ == "__main__":
+    main()

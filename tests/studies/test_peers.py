@@ -1,0 +1,277 @@
+"""Peers learn from what ours learn from, act where ours act, and their rows are rows."""
+
+import io
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from peers import cells, command
+from peers.process import PeerError, PeerProcess
+from peers.protocol import read_dataset, receive, send
+
+from sb3_dtfm.algorithms import ALGORITHMS
+from sb3_dtfm.benchmark.evaluation import FINAL_STATES, evaluate, make_seeded_envs
+from sb3_dtfm.benchmark.rows import read_rows
+from sb3_dtfm.data import Trajectory, TrajectoryBuffer, load_dataset
+from sb3_dtfm.zoo.arguments import UsageError
+
+ROOT = Path(__file__).parents[2]
+TINY = "tests.studies.tiny_worker"
+PEERS = cells.read_entries(cells.HERE / "settings.yml", cells.Peer)
+# Each peer with all the settings that it has, and a kind of task for each.
+SETTINGS = [(name, kind) for name, peer in PEERS.items() for kind in dict.fromkeys((peer.only[0], *peer.kinds))]
+PYTHONS = {worker: ROOT / folder / "bin" / "python" for worker, folder in command.FOLDERS.items()}
+
+
+@pytest.fixture(autouse=True)
+def at_the_root(monkeypatch):
+    """As `make peers` is called; the tiny worker is found from here."""
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+
+
+@pytest.fixture
+def buffer() -> TrajectoryBuffer:
+    """Episodes of Pendulum with every kind of end, whose actions are a linear map of what is seen."""
+    rng = np.random.default_rng(0)
+    matrix = np.array([[0.5], [-0.3], [0.1]])
+    episodes = []
+    for i, length in enumerate((7, 12, 5, 9, 20)):
+        observations = rng.uniform(-1, 1, (length, 3)).astype(np.float32)
+        ends = dict(terminated=i % 3 == 0, truncated=i % 3 == 1)
+        rewards = np.full(length, float(i))
+        episodes.append(Trajectory(observations, (2 * observations @ matrix).astype(np.float32), rewards, **ends))
+    return TrajectoryBuffer.from_trajectories(episodes, spaces.Box(-2, 2, (1,)))
+
+
+@pytest.fixture
+def datasets(tmp_path, buffer) -> Path:
+    """A file like studies/peers.yml, of one dataset."""
+    buffer.save(tmp_path / "pendulum.npz")
+    (tmp_path / "peers.yml").write_text(
+        f"pendulum: {{task: Pendulum-v1, kind: arm, dataset: {tmp_path / 'pendulum.npz'}, target_return: 0, minutes: 1}}\n"
+    )
+    return tmp_path / "peers.yml"
+
+
+def tiny_process(tmp_path: Path) -> PeerProcess:
+    return PeerProcess(Path(sys.executable), TINY, tmp_path / "log")
+
+
+def test_a_message_arrives_as_it_was_sent():
+    stream = io.BytesIO()
+    arrays = {"a": np.arange(6.0).reshape(2, 3)[:, ::2], "none": np.zeros((0, 4), np.float32), "flag": np.array(True)}
+    send(stream, "act", arrays, number=0.1, text="für\n")
+    send(stream, "next")
+    stream.seek(0)
+    message = receive(stream)
+    assert (message.what, message.values) == ("act", {"number": 0.1, "text": "für\n"})
+    for name, array in arrays.items():
+        assert message.arrays[name].dtype == array.dtype
+        np.testing.assert_array_equal(message.arrays[name], array)
+    assert receive(stream).what == "next"
+    with pytest.raises(EOFError):
+        receive(stream)
+
+
+@pytest.mark.parametrize(("fraction", "best_share"), [(1.0, None), (0.6, None), (1.0, 0.4)])
+def test_a_peer_is_given_the_steps_that_ours_learn_from(datasets, buffer, tmp_path, fraction, best_share):
+    data = cells.read_entries(datasets, cells.Data)["pendulum"]._replace(fraction=fraction)
+    cells.export(data, cells.Peer("any", "d3rlpy", 1, {}, best_share=best_share), tmp_path / "out.npz")
+    expected = buffer.random_fraction(fraction, seed=0)
+    expected = expected if best_share is None else expected.best(best_share=best_share)
+    given = read_dataset(tmp_path / "out.npz")
+    assert [len(episode.actions) for episode in given.episodes] == expected.episode_lengths.tolist()
+    assert [episode.terminated for episode in given.episodes] == expected.terminated.tolist()
+    for name in ("observations", "rewards"):
+        steps = np.concatenate([getattr(episode, name) for episode in given.episodes])
+        np.testing.assert_array_equal(steps, getattr(expected, name)[expected.rows].numpy())
+    scaled = np.concatenate([episode.actions for episode in given.episodes])
+    assert np.abs(scaled).max() <= 1.0
+    np.testing.assert_allclose(given.to_environment(scaled), expected.actions[expected.rows].numpy(), atol=1e-6)
+
+
+def test_a_peer_learns_and_acts_in_the_range_of_the_environment(tmp_path, buffer):
+    buffer.save(tmp_path / "episodes.npz")
+    observations = np.random.default_rng(1).uniform(-1, 1, (3, 3)).astype(np.float32)
+    with tiny_process(tmp_path) as process:
+        training = process.train(tmp_path / "episodes.npz", {"learning_rate": 0.5}, 0, 50, None)
+        asked = {"observation": observations, "return_to_go": np.zeros((3, 1), np.float32)}
+        actions, state = process.predict(asked, None, np.array([True, True, True]))
+        again, _ = process.predict(asked, None, np.array([False, True, False]))
+        assert process.action_ms() > 0.0
+    assert (training.n_steps, process.versions.keys()) == (50, {"numpy"})
+    assert state is None
+    # The range is from -2 to 2; the action tells how long each environment's own episode has been.
+    np.testing.assert_allclose(actions, [[0.002]] * 3, atol=1e-6)
+    np.testing.assert_allclose(again, [[0.004], [0.002], [0.004]], atol=1e-6)
+    assert "does no harm" in (tmp_path / "log").read_text()
+
+
+def test_the_minutes_end_a_training_before_the_steps_do(tmp_path, buffer):
+    buffer.save(tmp_path / "episodes.npz")
+    with tiny_process(tmp_path) as process:
+        training = process.train(tmp_path / "episodes.npz", {"learning_rate": 0.5}, 0, 10**9, 0.1 / 60)
+    assert 1 <= training.n_steps < 10**6
+    assert training.processor_seconds < 2.0
+
+
+def test_an_ended_peer_names_its_log_and_why(tmp_path, buffer):
+    buffer.save(tmp_path / "episodes.npz")
+    with (
+        pytest.raises(PeerError, match=r"tiny_worker has ended with code 1, see .*log: ValueError: no such layer"),
+        tiny_process(tmp_path) as process,
+    ):
+        process.train(tmp_path / "episodes.npz", {"fail": "no such layer"}, 0, 50, None)
+
+
+ENDLESS = """
+import sys
+from pathlib import Path
+sys.path.append("studies")
+from peers.process import PeerProcess
+folder = Path(sys.argv[1])
+with PeerProcess(Path(sys.executable), "tests.studies.tiny_worker", folder / "log") as process:
+    on_progress = lambda done, n_steps: print(done, flush=True)
+    process.train(folder / "episodes.npz", {"learning_rate": 0.1}, 0, 10**9, None, on_progress)
+"""
+
+
+def test_a_killed_command_takes_its_peer_along(tmp_path, buffer):
+    buffer.save(tmp_path / "episodes.npz")
+    with subprocess.Popen([sys.executable, "-c", ENDLESS, str(tmp_path)], stdout=subprocess.PIPE) as process:
+        assert int(process.stdout.readline()) > 0, "it is training"
+        process.kill()
+    end = time.monotonic() + 20.0
+    while "BrokenPipeError" not in (tmp_path / "log").read_text():
+        assert time.monotonic() < end, "it goes on without anybody to tell"
+        time.sleep(0.1)
+
+
+def command_line(tmp_path: Path, datasets: Path, *more: str) -> list[str]:
+    settings = tmp_path / "settings.yml"
+    if not settings.exists():
+        settings.write_text("linear: {worker: d3rlpy, n_timesteps: 20, settings: {learning_rate: 0.5}}\n")
+    folders = ["-o", str(tmp_path / "rows"), "-f", str(tmp_path / "logs"), "--d3rlpy-python", sys.executable]
+    line = ["--datasets", str(datasets), "--settings", str(settings), "--algo", "linear", "--seeds", "3"]
+    return [*line, *folders, "--final-episodes", "3", "--n-eval-envs", "2", *more]
+
+
+def test_a_finished_cell_is_a_row_and_is_not_run_again(tmp_path, datasets, buffer, monkeypatch, capsys):
+    monkeypatch.setitem(cells.WORKERS, "d3rlpy", TINY)
+    command.main(command_line(tmp_path, datasets))
+    (file,) = (tmp_path / "rows").glob("*.jsonl")
+    (row,) = read_rows(file)
+    assert file.name == "Pendulum-v1_1_linear_seed3_authors_pendulum.jsonl"
+    assert (row["step"], row["final"], row["settings"]["d3rlpy"]) == (20, True, {"learning_rate": 0.5})
+    assert (row["settings"]["n_timesteps"], row["settings"]["minutes"]) == (20, 1.0)
+    assert row["data"]["n_steps"] == len(buffer)
+    assert row["action_ms"] > 0.0
+    assert "peer's numpy" in row["versions"]
+
+    # The same initial states as ours: an episode by hand, with the same actions.
+    vec_env = make_seeded_envs("Pendulum-v1", cells.read_entries(datasets, cells.Data)["pendulum"].settings(), 1)
+    assert evaluate(Counting(), vec_env, range(FINAL_STATES, FINAL_STATES + 3)).returns == pytest.approx(row["returns"])
+
+    before = file.read_text()
+    command.main(command_line(tmp_path, datasets))
+    assert "finished already" in capsys.readouterr().out
+    assert file.read_text() == before
+    with pytest.raises(UsageError, match=r"is there with another minutes"):
+        command.main(command_line(tmp_path, datasets, "--minutes", "2"))
+
+
+class Counting:
+    """Acts as the tiny worker does in a space of one action: by how long the episode has been."""
+
+    def __init__(self) -> None:
+        self.seen = 0
+
+    def predict(self, observations: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False) -> Any:
+        self.seen = 1 if episode_start[0] else self.seen + 1
+        return np.array([[2 * self.seen / 1000]], np.float32), None
+
+
+def test_a_failing_cell_leaves_no_row_and_does_not_stop_the_others(tmp_path, datasets, monkeypatch, capsys):
+    monkeypatch.setitem(cells.WORKERS, "d3rlpy", TINY)
+    linear = "{worker: d3rlpy, n_timesteps: 5, settings: {learning_rate: 0.5}}"
+    broken = "{worker: d3rlpy, n_timesteps: 5, settings: {fail: on purpose}}"
+    (tmp_path / "settings.yml").write_text(f"broken: {broken}\nlinear: {linear}\n")
+    with pytest.raises(SystemExit) as end:
+        command.main(command_line(tmp_path, datasets, "--algo", "broken", "linear"))
+    assert end.value.code == 1
+    assert [row.name.split("_")[2] for row in (tmp_path / "rows").glob("*.jsonl")] == ["linear"]
+    assert "FAILED" in (said := capsys.readouterr().out)
+    assert "on purpose" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--data", "moon"), r"--data: unknown moon; known are pendulum"),
+        (("--algo", "moon"), r"--algo: unknown moon; known are dt, dtfm, linear"),
+        (("--steps", "0"), r"--steps: must be more than 0, got 0"),
+        (("--d3rlpy-python", "nowhere/python"), r"nowhere/python does not exist; `make peers` installs it"),
+    ],
+)
+def test_a_mistake_is_named_before_anything_runs(tmp_path, datasets, arguments, message):
+    with pytest.raises(UsageError, match=message):
+        command.main(command_line(tmp_path, datasets, *arguments))
+    assert not (tmp_path / "rows").exists()
+
+
+def test_a_dataset_that_is_missing_is_named_with_where_its_recipe_is(tmp_path, datasets):
+    (tmp_path / "pendulum.npz").unlink()
+    with pytest.raises(UsageError, match=r"pendulum: .*pendulum.npz.* studies/peers.yml says how to record it"):
+        command.main(command_line(tmp_path, datasets))
+
+
+def test_every_dataset_of_the_comparison_is_a_task_with_settings_for_us_and_for_its_peers():
+    for name, data in cells.read_entries(ROOT / "studies" / "peers.yml", cells.Data).items():
+        assert data.kind in cells.KINDS, name
+        assert data.peers.keys() <= PEERS.keys(), name
+        assert data.settings()["env_wrapper"], name
+        if data.task != "PushT-v0":
+            gym.spec(data.task)
+    for peer in PEERS.values():
+        assert peer.worker in cells.WORKERS
+        assert {*peer.only, *peer.kinds} <= set(cells.KINDS)
+    assert not set(PEERS) & set(ALGORITHMS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "kind"), SETTINGS)
+def test_a_peer_trains_and_acts(tmp_path, datasets, name, kind):
+    worker = PEERS[name].worker
+    if not (python := PYTHONS[worker]).exists():
+        pytest.skip(f"{python} does not exist; `make peers` installs it")
+    datasets.write_text(datasets.read_text().replace("kind: arm", f"kind: {kind}"))
+    line = ["--datasets", str(datasets), "--algo", name, "--seeds", "0", "--steps", "12", "--n-eval-envs", "2"]
+    line += ["--final-episodes", "3", "-o", str(tmp_path / "rows"), "-f", str(tmp_path), f"--{worker}-python", str(python)]
+    command.main(line)
+    (file,) = (tmp_path / "rows").glob("*.jsonl")
+    (row,) = read_rows(file)
+    assert (row["algo"], row["step"], row["lengths"]) == (name, 12, [200] * 3)
+    assert f"peer's {worker}" in row["versions"]
+
+
+@pytest.mark.slow
+def test_d3rlpy_and_ours_read_the_same_of_a_file(tmp_path, buffer):
+    """BC learns the map by heart that the episodes were made with, through scaling and standardising and back."""
+    if not PYTHONS["d3rlpy"].exists():
+        pytest.skip("`make peers` installs d3rlpy")
+    buffer.save(tmp_path / "episodes.npz")
+    settings = PEERS["bc"].settings | {"hidden": [64, 64]}
+    steps = load_dataset(tmp_path / "episodes.npz")
+    observations, actions = (getattr(steps, name)[steps.rows].numpy() for name in ("observations", "actions"))
+    with PeerProcess(PYTHONS["d3rlpy"], cells.WORKERS["d3rlpy"], tmp_path / "log") as process:
+        process.train(tmp_path / "episodes.npz", settings, 0, 500, None)
+        n = len(observations)
+        found, _ = process.predict({"observation": observations, "return_to_go": np.zeros((n, 1))}, None, np.ones(n, bool))
+    assert np.abs(found - actions).mean() < 0.1
