@@ -5,7 +5,10 @@ Balls are pushed about a maze at random for a while, each from a cell of its own
 and none of those that begin where a model will have to begin gets there.
 
     python studies/random_walks.py record
-    sb3-dtfm benchmark $(python studies/random_walks.py arguments) --seeds 0 1 2
+    sb3-dtfm benchmark $(python studies/random_walks.py arguments) --seeds 0 1 2 --algo dt dtfm --label plain \
+        -params "policy_kwargs:dict(chunk_size=4,dropout=0.0)"
+    sb3-dtfm benchmark $(python studies/random_walks.py arguments) --seeds 0 1 2 --algo dtfm --label critic \
+        -params "policy_kwargs:dict(chunk_size=4,dropout=0.0,critic_steps=10,expectile=0.9,gamma=0.98,n_candidates=8)"
 """
 
 import argparse
@@ -77,7 +80,7 @@ def main() -> None:
     else:
         env_kwargs = [f"maze_map:{MAZE!r}".replace(" ", ""), "continuing_task:False", f"max_episode_steps:{MAX_STEPS}"]
         data = ["--dataset", f"{ENV_ID}={DATASET_ID}", "--target-return", "1", "--fractions", "1.0"]
-        print(*data, "-n", "2000", "--label", "random-walks", "--env-kwargs", *env_kwargs)
+        print(*data, "-n", "2000", "--eval-freq", "1000", "--env-kwargs", *env_kwargs)
 
 
 if __name__ == "__main__":

@@ -23,12 +23,18 @@ class ExportedPolicy(nn.Module):
     Actions of a Discrete space are vectors here: 1 for the choice, 0 for the others.
 
     :param policy: stays as it is; what acts of it is copied to the CPU
+    :raises ValueError: its critic would choose among several draws
     """
 
     noise_table: th.Tensor
 
     def __init__(self, policy: SequencePolicy) -> None:
         super().__init__()
+        if policy.n_candidates > 1:
+            raise ValueError(
+                f"n_candidates={policy.n_candidates}: a choice by the critic is not exported; `n_candidates:1` among the ways of "
+                "acting exports the flow alone."
+            )
         self.normalization: Normalization = copy.deepcopy(policy.normalization).cpu()
         self.network: SequenceNetwork = copy.deepcopy(policy.acting_network).cpu()
         self.register_buffer("noise_table", policy.noise_table.cpu())

@@ -118,8 +118,8 @@ class SequencePolicy(BasePolicy):
     :param gamma: discount of a step for the critic
     :param expectile: of the critic
     :param n_candidates: actions, or chunks, that are drawn each time, of which the critic has one taken; 1 asks no critic
-    :param temperature: how much chance that choice leaves, in units of how far actions' values spread in the data; 0 takes
-        the most valuable one
+    :param temperature: how much chance that choice leaves, in units of how far actions' values spread in the data; 0, the
+        default, takes the most valuable one
     :param ema: keep an exponential moving average of the weights and act with it
     :param kv_cache: act on the keys and values kept of earlier steps instead of recomputing the window: two to three times
         faster, and equal until the window slides (see :meth:`SequenceTrunk.extend`)
@@ -157,7 +157,7 @@ class SequencePolicy(BasePolicy):
         gamma: float = 0.99,
         expectile: float = 0.7,
         n_candidates: int = 1,
-        temperature: float = 0.1,
+        temperature: float = 0.0,
         ema: bool = False,
         kv_cache: bool = False,
         seed: int | None = None,
