@@ -64,10 +64,9 @@ def record(n_episodes: int) -> None:
     dataset = write_minari(DATASET_ID, episodes, env, {"algorithm_name": "pushed at random"})
     walked = [(episode.observations["achieved_goal"], episode.terminations[-1]) for episode in dataset.iterate_episodes()]
     from_start = [reached for path, reached in walked if path[0][0] < 0 < path[0][1] - 0.5]
-    print(
-        f"{dataset.id}: {n_episodes} walks, {dataset.total_steps} steps, {np.mean([reached for _, reached in walked]):.0%} come "
-        f"upon the goal; of the {len(from_start)} that began at the start, {sum(from_start)}"
-    )
+    share = np.mean([reached for _, reached in walked])
+    print(f"{dataset.id}: {n_episodes} walks, {dataset.total_steps} steps, {share:.0%} come upon the goal;")
+    print(f"of the {len(from_start)} that began at the start, {sum(from_start)}")
 
 
 def main() -> None:

@@ -32,8 +32,8 @@ class ExportedPolicy(nn.Module):
         super().__init__()
         if policy.n_candidates > 1:
             raise ValueError(
-                f"n_candidates={policy.n_candidates}: a choice by the critic is not exported; `n_candidates:1` among the ways of "
-                "acting exports the flow alone."
+                f"n_candidates={policy.n_candidates}: a choice by the critic is not exported; `n_candidates:1` among the ways "
+                "of acting exports the flow alone."
             )
         self.normalization: Normalization = copy.deepcopy(policy.normalization).cpu()
         self.network: SequenceNetwork = copy.deepcopy(policy.acting_network).cpu()

@@ -44,7 +44,7 @@ from sb3_dtfm.windows import (
     with_plan,
 )
 
-# How far apart in the noise table the candidates' rows lie, and those that chance chooses among them by: no divisor of its length.
+# How far apart in the noise table the candidates' rows lie, and those that chance chooses by: no divisors of its length.
 CANDIDATE_STRIDE, CHOICE_STRIDE, CHOICE_START = 97, 31, 513
 ACCEPTED: dict[str, Rule] = {
     "context_length": COUNT,
@@ -112,9 +112,9 @@ class SequencePolicy(BasePolicy):
     :param film_return_to_go: let the return-to-go scale and shift what each block of the trunk gets, besides being a token
     :param calm_units: scale observations by what calm episodes spread, for data in which some agents' spread far wider; see
         :meth:`EpisodeTable.statistics`
-    :param critic_steps: with each gradient step, how many a critic takes that learns what actions are worth, so that the best
-        of several can be taken, see :class:`~sb3_dtfm.policies.critic.Critic`; trunk and head learn as without. It needs a
-        head that draws; 0 for no critic
+    :param critic_steps: with each gradient step, how many a critic takes, which learns what actions are worth so that the
+        best of several can be taken, see :class:`~sb3_dtfm.policies.critic.Critic`; trunk and head learn as without. It
+        needs a head that draws; 0 for no critic
     :param gamma: discount of a step for the critic
     :param expectile: of the critic
     :param n_candidates: actions, or chunks, that are drawn each time, of which the critic has one taken; 1 asks no critic
@@ -201,8 +201,8 @@ class SequencePolicy(BasePolicy):
         if self.critic_steps:  # made last: the weights of all else are what they are without
             if self.network.head.noise_dim == 0:
                 raise ValueError(
-                    f"critic_steps={critic_steps}: the critic has nothing to choose among: {self.head_class.algorithm} makes one action of what it "
-                    "sees, where DTFM draws."
+                    f"critic_steps={critic_steps}: the critic has nothing to choose among: {self.head_class.algorithm} makes "
+                    "one action of what it sees, where DTFM draws."
                 )
             self.critic = Critic(self.observation_dim, self.n_valued * self.action_dim, expectile=expectile)
         self._check_candidates(self.n_candidates)
@@ -586,7 +586,7 @@ class SequencePolicy(BasePolicy):
     def _check_candidates(self, n_candidates: int) -> None:
         if n_candidates > 1 and self.critic is None:
             raise ValueError(
-                f"n_candidates={n_candidates} needs a model that was trained with policy_kwargs=dict(critic_steps=...), above 0."
+                f"n_candidates={n_candidates} needs a model that was trained with policy_kwargs=dict(critic_steps=...)."
             )
 
     def set_acting(self, **settings: Any) -> None:

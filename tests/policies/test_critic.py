@@ -140,8 +140,7 @@ def test_a_choice_repeats_and_is_saved(decided, tmp_path):
 
 def test_trunk_and_flow_learn_as_without(cheetah_buffer):
     plain, guided = (
-        make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=n, chunk_size=3)).learn(5)
-        for n in (0, 2)
+        make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=n, chunk_size=3)).learn(5) for n in (0, 2)
     )
     for name, weight in plain.policy.network.state_dict().items():
         assert th.equal(guided.policy.network.state_dict()[name], weight), name
