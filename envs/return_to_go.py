@@ -140,9 +140,7 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._timestep += 1
         return self._observe(observation), reward, terminated, truncated, info
 
-    def _step_through(
-        self, actions: np.ndarray
-    ) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
+    def _step_through(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
         """:param actions: (N, A)"""
         observations, total, terminated, truncated, info = [], 0.0, False, False, {}
         for action in actions:

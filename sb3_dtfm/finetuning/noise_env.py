@@ -1,7 +1,6 @@
 """The environment that an online algorithm sees: its actions are the noise of a frozen policy."""
 
 from os import PathLike
-from typing import Any
 
 import numpy as np
 import torch as th

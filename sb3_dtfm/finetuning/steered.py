@@ -71,7 +71,9 @@ class SteeredDTFM(DTFM):
 
     def learn(self, *args: Any, **kwargs: Any) -> NoReturn:  # type: ignore[override]
         """:raises ValueError: always"""
-        raise ValueError("A steered model does not learn from data: it would no longer be what its steering was learned for.")
+        raise ValueError(
+            "A steered model does not learn from data: it would no longer be what its steering was learned for."
+        )
 
 
 def _take_over(agent: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
@@ -122,5 +124,5 @@ def _take_over(agent: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, th.Tenso
 
 def _refuse(agent: BaseAlgorithm, why: str) -> NoReturn:
     raise ValueError(
-        f"The actor of {type(agent).__name__} cannot be taken over: {why}. The \"MlpPolicy\" of {', '.join(SQUASHED)} can."
+        f'The actor of {type(agent).__name__} cannot be taken over: {why}. The "MlpPolicy" of {", ".join(SQUASHED)} can.'
     )

@@ -68,7 +68,9 @@ class SteeredCallbacks(BaseCallback):
 
     def _looking(self) -> list[tuple[BaseCallback, int]]:
         """Those of the callbacks that look at the model now and then, and how often."""
-        frequencies = ((each, getattr(each, "eval_freq", 0) or getattr(each, "save_freq", 0)) for each in self.inner.callbacks)
+        frequencies = (
+            (each, getattr(each, "eval_freq", 0) or getattr(each, "save_freq", 0)) for each in self.inner.callbacks
+        )
         return [(each, frequency) for each, frequency in frequencies if frequency > 0]
 
     def _take_over(self) -> None:
