@@ -1,11 +1,12 @@
 """RL-Zoo's experiment of an online algorithm that steers a frozen DTFM."""
 
 import os
+import shutil
 from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
-from rl_zoo3.exp_manager import ExperimentManager
+import yaml
 from rl_zoo3.utils import get_latest_run_id, get_saved_hyperparams
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback, EvalCallback
@@ -16,13 +17,25 @@ from sb3_dtfm.algorithms import DTFM
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.finetuning import NoiseActionVecEnv, SteeredDTFM
 from sb3_dtfm.zoo.arguments import UsageError
-from sb3_dtfm.zoo.manager import TrainingError
+from sb3_dtfm.zoo.manager import OfflineExperimentManager
 from sb3_dtfm.zoo.registration import STEERED
 
 # The key of the settings of a NoiseActionVecEnv in a run's config.yml, where `enjoy` must not find a wrapper.
 NOISE_ENV = "noise_env"
 # The online algorithm itself, as Stable-Baselines3 saves it.
 AGENT = "agent"
+
+
+def _environment_of(run: Path) -> dict[str, Any]:
+    """
+    What a run's environment was made with, as `enjoy` finds it.
+
+    :param run: the folder that holds its config.yml and args.yml, or does not exist
+    """
+    known = get_saved_hyperparams(str(run))[0] if (run / "config.yml").is_file() else {}
+    arguments = yaml.load((run / "args.yml").read_text(), Loader=yaml.UnsafeLoader) if (run / "args.yml").is_file() else {}
+    env_kwargs = arguments.get("env_kwargs") or known.get("env_kwargs")
+    return {"env_wrapper": known.get("env_wrapper"), "env_kwargs": env_kwargs}
 
 
 class SteeredCallbacks(BaseCallback):
@@ -84,7 +97,7 @@ def has_learned(agent: BaseAlgorithm) -> bool:
     return getattr(agent, "_n_updates", 0) > 0
 
 
-class FinetuningManager(ExperimentManager):
+class FinetuningManager(OfflineExperimentManager):
     """
     RL-Zoo's own manager, for an online algorithm in a :class:`~sb3_dtfm.finetuning.NoiseActionVecEnv`.
 
@@ -111,11 +124,12 @@ class FinetuningManager(ExperimentManager):
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """RL-Zoo's; what the environment was to the frozen policy comes from its run."""
         hyperparams, _ = super().read_hyperparameters()
-        run = self.base_file.parent / self.env_name
-        known = get_saved_hyperparams(str(run))[0] if (run / "config.yml").is_file() else {}
-        for key in ("env_wrapper", "env_kwargs"):
-            if known.get(key):
-                hyperparams.setdefault(key, known[key])
+        known = _environment_of(self.base_file.parent / self.env_name)
+        if self.env_kwargs:  # of the command line
+            del known["env_kwargs"]
+        hyperparams = {**{key: value for key, value in known.items() if value}, **hyperparams}
+        if self._eval_env_kwargs_args is None:
+            self.eval_env_kwargs = hyperparams.get("env_kwargs") or self.env_kwargs
         if self.target_return is not None:
             hyperparams["env_wrapper"] = [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": self.target_return}}]
         if not hyperparams.get("env_wrapper"):
@@ -160,20 +174,20 @@ class FinetuningManager(ExperimentManager):
         others = [each for each in self.callbacks if each not in of_the_model]
         self.callbacks = [*others, SteeredCallbacks(self.steered, of_the_model, self.seed)]
 
-    def learn(self, model: BaseAlgorithm) -> None:
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """
         RL-Zoo's.
 
-        :param model: the online algorithm
         :raises ValueError: an actor that cannot be taken over
-        :raises TrainingError: whatever went wrong
         """
-        SteeredDTFM.of(self.steered, model)
+        result = super().setup_experiment()
+        assert result is not None
         try:
-            super().learn(model)
-        except Exception as error:
-            message = f"Training ended after {model.num_timesteps} timesteps: {type(error).__name__}: {error}"
-            raise TrainingError(message) from error
+            SteeredDTFM.of(self.steered, result[0])
+        except ValueError:
+            shutil.rmtree(self.save_path)
+            raise
+        return result
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """
