@@ -142,7 +142,8 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def _step_through(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
         """:param actions: (N, A)"""
-        observations, total, terminated, truncated, info = [], 0.0, False, False, {}
+        observations, total, terminated, truncated = [], 0.0, False, False
+        info: dict[str, Any] = {}
         for action in actions:
             observation, reward, terminated, truncated, info = self.step(action)
             observations.append(observation)

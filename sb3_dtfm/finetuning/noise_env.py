@@ -77,6 +77,7 @@ class NoiseActionVecEnv(VecEnvWrapper):
         observation_space = spaces.Box(-OBSERVATION_CLIP, OBSERVATION_CLIP, (n_shown,), np.float32)
         super().__init__(venv, observation_space, NoiseSpace(noise_dim, bound))
         self.model = model
+        self.bound = float(bound)
         self.hidden_state = hidden_state
         self.n_environment_steps = 0
         self._known: tuple[Context, th.Tensor] | None = None  # each row's newest step, and its hidden state

@@ -69,7 +69,7 @@ class SteeredDTFM(DTFM):
         assert self.policy.steering is not None
         self.policy.steering.load_state_dict(weights)
 
-    def learn(self, *args: Any, **kwargs: Any) -> NoReturn:  # type: ignore[override]
+    def learn(self, *args: Any, **kwargs: Any) -> NoReturn:
         """:raises ValueError: always"""
         raise ValueError(
             "A steered model does not learn from data: it would no longer be what its steering was learned for."
@@ -110,7 +110,7 @@ def _take_over(agent: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, th.Tenso
         "layers": [each.out_features for each in linear],
         "activation": activations.pop(),
         "squashed": SQUASHED[name],
-        "bound": float(env.action_space.high[0]),
+        "bound": env.bound,
         "hidden_state": env.hidden_state,
     }
     weights = {f"layers.{i}.0.{key}": value for i, each in enumerate(linear) for key, value in each.state_dict().items()}

@@ -5,7 +5,7 @@ from typing import Any
 import torch as th
 from torch import nn
 
-from sb3_dtfm.arguments import BOOLEAN, COUNT, POSITIVE, Choice, check_arguments
+from sb3_dtfm.arguments import BOOLEAN, COUNT, POSITIVE, Choice, Rule, check_arguments
 from sb3_dtfm.policies.normalization import OBSERVATION_CLIP, Normalization
 from sb3_dtfm.windows import Windows
 
@@ -15,6 +15,12 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
 # Logarithms of standard deviations, as Stable-Baselines3's SAC limits them.
 LOG_STD_RANGE = (-20.0, 2.0)
 MAX_LAYERS = 32
+ACCEPTED: dict[str, Rule] = {
+    "activation": Choice(tuple(ACTIVATIONS)),
+    "squashed": BOOLEAN,
+    "bound": POSITIVE,
+    "hidden_state": BOOLEAN,
+}
 
 
 def steering_observation(normalization: Normalization, newest: Windows, hidden: th.Tensor | None) -> th.Tensor:
@@ -65,8 +71,7 @@ class Steering(nn.Module):
         hidden_state: bool,
     ) -> None:
         super().__init__()
-        rules = {"squashed": BOOLEAN, "hidden_state": BOOLEAN, "bound": POSITIVE, "activation": Choice(tuple(ACTIVATIONS))}
-        check_arguments(locals(), rules)
+        check_arguments(locals(), ACCEPTED)
         if not isinstance(layers, list) or len(layers) > MAX_LAYERS or not all(map(COUNT.accepts, layers)):
             raise ValueError(f"layers must be at most {MAX_LAYERS} whole numbers of at least 1, got {layers!r}.")
         self.squashed = squashed

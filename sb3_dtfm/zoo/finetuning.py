@@ -170,7 +170,9 @@ class FinetuningManager(OfflineExperimentManager):
     def create_callbacks(self) -> None:
         """RL-Zoo's; evaluations and checkpoints are of the steered model."""
         super().create_callbacks()
-        of_the_model = [each for each in self.callbacks if isinstance(each, EvalCallback | CheckpointCallback)]
+        of_the_model: list[BaseCallback] = [
+            each for each in self.callbacks if isinstance(each, EvalCallback | CheckpointCallback)
+        ]
         others = [each for each in self.callbacks if each not in of_the_model]
         self.callbacks = [*others, SteeredCallbacks(self.steered, of_the_model, self.seed)]
 

@@ -211,16 +211,16 @@ def test_environment_steps_are_counted():
 
 
 def test_what_cannot_be_steered_is_refused():
-    with pytest.raises(ValueError, match="DT of Box.* has no flow whose noise could be chosen; a DTFM is needed"):
+    with pytest.raises(ValueError, match=r"DT of Box.* has no flow whose noise could be chosen; a DTFM is needed"):
         NoiseActionVecEnv(make_venv(), _tiny(DT))
     cart = dict(observations=np.zeros((9, 4)), actions=np.array([0, 1] * 4 + [0]), rewards=np.ones(9))
     env = make_vec_env("CartPole-v1", wrapper_class=ReturnToGoWrapper, wrapper_kwargs=dict(target_return=9.0))
     discrete = make_model(DT, [cart], dataset_kwargs=dict(action_space=spaces.Discrete(2)))
     with pytest.raises(ValueError, match=r"DT of Discrete\(2\) has no flow"):
         NoiseActionVecEnv(env, discrete)
-    with pytest.raises(ValueError, match="The environment has observations of .*, the model's are"):
+    with pytest.raises(ValueError, match=r"The environment has observations of .*, the model's are"):
         NoiseActionVecEnv(env, _tiny())
-    with pytest.raises(ValueError, match="must be wrapped in sb3_dtfm.envs.ReturnToGoWrapper"):
+    with pytest.raises(ValueError, match=r"must be wrapped in sb3_dtfm.envs.ReturnToGoWrapper"):
         NoiseActionVecEnv(make_vec_env("HalfCheetah-v5"), _tiny())
-    with pytest.raises(ValueError, match="bound must be a number of at least 0|bound must be a number above 0, got -1"):
+    with pytest.raises(ValueError, match="bound must be a number above 0, got -1"):
         NoiseActionVecEnv(make_venv(), _tiny(), bound=-1)
