@@ -51,7 +51,10 @@ ROOMS = {
         {"", "algorithms", "arguments", "policies", "callbacks", "envs", "distributed", "files", "finetuning", "zoo"},
     ),
     "benchmark": ("sb3_dtfm/benchmark", {"", "algorithms", "data", "envs", "zoo", "benchmark", "files"}),
-    "cli": ("sb3_dtfm/cli", {"", "actions", "algorithms", "data", "envs", "recording", "zoo", "benchmark", "files", "cli"}),
+    "cli": (
+        "sb3_dtfm/cli",
+        {"", "actions", "algorithms", "data", "envs", "finetuning", "recording", "zoo", "benchmark", "files", "cli"},
+    ),
 }
 
 

@@ -13,6 +13,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_dtfm import DTFM
 from sb3_dtfm.files import ModelFileError
 from sb3_dtfm.finetuning import NoiseActionVecEnv, SteeredDTFM
+from sb3_dtfm.policies.exported import ExportedPolicy
+from sb3_dtfm.windows import Context, Windows
 from tests.algorithms.small import make_model
 from tests.finetuning.test_noise_env import CHUNKS, make_venv, table_noise
 
@@ -175,3 +177,31 @@ def test_a_file_whose_steering_is_damaged_is_refused(model, agent, tmp_path, cha
             damaged.writestr(name, content)
     with pytest.raises(ModelFileError, match=message):
         SteeredDTFM.load(tmp_path / "damaged.zip")
+
+
+@pytest.mark.slow
+def test_an_exported_file_acts_as_the_steered_model_does(model, agent, tmp_path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    from sb3_dtfm.cli.main import main
+
+    steered = SteeredDTFM.of(model, agent)
+    steered.save(tmp_path / "steered")
+    assert main(["export", str(tmp_path / "steered.zip"), "-o", str(tmp_path / "steered.onnx")]) == 0
+    exported = ExportedPolicy(steered.policy)
+    inputs = exported.example(3)
+    for noise in (inputs["noise"], th.zeros_like(inputs["noise"])):
+        inputs = {**inputs, "noise": noise}
+        session = onnxruntime.InferenceSession(tmp_path / "steered.onnx")
+        (chunk,) = session.run(["chunk"], {name: each.numpy() for name, each in inputs.items()})
+        np.testing.assert_allclose(chunk, exported(**inputs)[0].numpy(), atol=1e-4)
+    observations = make_venv().reset()
+    _, state = steered.predict(observations, episode_start=np.ones(3, bool), deterministic=True)
+    of_a_first_step = {
+        **{name: th.from_numpy(each) for name, each in zip(Windows._fields, state, strict=False)},
+        "actions": model.policy.normalization.unscale_action(th.zeros(3, 5, 6)),
+        "noise": th.zeros_like(inputs["noise"]),
+        "episode_keys": th.from_numpy(state[Context._fields.index("episode_keys")]),
+    }
+    (chunk,) = session.run(["chunk"], {name: each.numpy() for name, each in of_a_first_step.items()})
+    actions, _ = steered.predict(observations, episode_start=np.ones(3, bool), deterministic=True)
+    np.testing.assert_allclose(chunk[:, 0], actions, atol=1e-4)
