@@ -139,7 +139,7 @@ def measure(env_id: str, n_envs: int, seconds: float) -> Iterator[dict[str, Any]
     for name in ("n_timesteps", "n_envs", "vec_env_wrapper", "learning_starts"):
         settings.pop(name)
     learning = NoiseActionVecEnv(make_envs(env_id, n_envs), model)
-    agent = SAC(env=learning, device="cpu", seed=0, learning_starts=20 * n_envs, **settings)
+    agent = SAC(env=learning, device="cpu", seed=0, learning_starts=n_envs, **settings)
     timed = Timed({"environment and policy": (learning, "step"), "gradient steps": (agent, "train")})
     start = time.perf_counter()
     agent.learn(10**9, callback=lambda *_: time.perf_counter() - start < seconds)

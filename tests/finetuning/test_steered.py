@@ -7,6 +7,7 @@ import zipfile
 import numpy as np
 import pytest
 import torch as th
+from sb3_contrib import TQC
 from stable_baselines3 import A2C, PPO, SAC, TD3
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -18,7 +19,8 @@ from sb3_dtfm.windows import Context, Windows
 from tests.algorithms.small import make_model
 from tests.finetuning.test_noise_env import CHUNKS, make_venv, table_noise
 
-QUICK = {SAC: dict(learning_starts=6, batch_size=8), PPO: dict(n_steps=4, batch_size=4, n_epochs=1), A2C: dict(n_steps=4)}
+OFF_POLICY = dict(learning_starts=6, batch_size=8)
+QUICK = {SAC: OFF_POLICY, TQC: OFF_POLICY, PPO: dict(n_steps=4, batch_size=4, n_epochs=1), A2C: dict(n_steps=4)}
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +39,7 @@ def agent(model):
     return make_agent(model, hidden_state=True).learn(30)
 
 
-@pytest.mark.parametrize(("algorithm", "hidden_state"), [(SAC, False), (SAC, True), (PPO, False), (A2C, True)])
+@pytest.mark.parametrize(("algorithm", "hidden_state"), [(SAC, False), (SAC, True), (TQC, False), (PPO, False), (A2C, True)])
 def test_noise_is_a_draw_of_the_actors_own_distribution(model, algorithm, hidden_state):
     """The actor's mean and standard deviation, as Stable-Baselines3 computes them, and the row of the noise table."""
     agent = make_agent(model, algorithm, hidden_state).learn(30)
@@ -46,7 +48,7 @@ def test_noise_is_a_draw_of_the_actors_own_distribution(model, algorithm, hidden
     shown = th.as_tensor(env.reset())
     drawn = th.as_tensor(table_noise(model.policy, env._known[0]))
     with th.no_grad():
-        if algorithm is SAC:
+        if algorithm in (SAC, TQC):
             mean, log_std, _ = agent.actor.get_action_dist_params(shown)
             expected = 1.5 * (mean + log_std.exp() * drawn).tanh()
         else:
