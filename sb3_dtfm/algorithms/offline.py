@@ -193,7 +193,7 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         generator = th.Generator(self.device).manual_seed(step_seed(self._training_seed, self._n_updates, TRANSITIONS))
         for _ in range(self.policy.critic_steps):
             batch = self.buffer.sample_transitions(critic.batch_size, self.policy.n_valued, self.policy.gamma, generator)
-            parts = critic.learn(self.policy.scaled_transitions(batch))
+            parts = critic.learn(self.policy.normalization.scale_transitions(batch))
         return parts
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:

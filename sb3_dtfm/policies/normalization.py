@@ -7,7 +7,7 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_dtfm.windows import Windows
+from sb3_dtfm.windows import Transitions, Windows
 
 # Observations are clipped at this many standard deviations, as SB3's VecNormalize does.
 OBSERVATION_CLIP = 10.0
@@ -112,6 +112,15 @@ class Normalization(nn.Module):
         """Normalised and clipped, (..., O)."""
         scaled = (observations - self.observation_mean) / self.observation_std
         return scaled.clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP) * self.observation_gain
+
+    def scale_transitions(self, batch: Transitions) -> Transitions:
+        """Those of a buffer as a critic takes them: observations normalised, actions in [-1, 1]."""
+        actions = batch.actions.view(len(batch.actions), -1, len(self.action_low))
+        return batch._replace(
+            observations=self.scale_observation(batch.observations),
+            next_observations=self.scale_observation(batch.next_observations),
+            actions=self.scale_action(actions).flatten(1),
+        )
 
     def scale_action(self, action: Any) -> Any:
         """From the environment's range to [-1, 1], (..., A)."""

@@ -32,9 +32,9 @@ from sb3_dtfm.networks.trunk import SequenceTrunk
 from sb3_dtfm.policies.critic import Critic
 from sb3_dtfm.policies.memory import RememberedContext
 from sb3_dtfm.policies.normalization import Normalization
+from sb3_dtfm.policies.steering import Steering, make_steering, steering_observation
 from sb3_dtfm.windows import (
     Context,
-    Transitions,
     Windows,
     check_context,
     empty_context,
@@ -201,11 +201,12 @@ class SequencePolicy(BasePolicy):
         if self.critic_steps:  # made last: the weights of all else are what they are without
             if self.network.head.noise_dim == 0:
                 raise ValueError(
-                    f"critic_steps={critic_steps}: the critic has nothing to choose among: {self.head_class.algorithm} makes "
-                    "one action of what it sees, where DTFM draws."
+                    f"critic_steps={critic_steps}: the critic has nothing to choose among: {self.head_class.algorithm} "
+                    "makes one action of what it sees, where DTFM draws."
                 )
             self.critic = Critic(self.observation_dim, self.n_valued * self.action_dim, expectile=expectile)
         self._check_candidates(self.n_candidates)
+        self.steering: Steering | None = None
         self._acting_generator: th.Generator | None = None
         self._remembered = RememberedContext()
 
@@ -367,16 +368,9 @@ class SequencePolicy(BasePolicy):
         arrays, vectorized = unpack_observation(observation, self.observation_dim)
         n_rows, timestep = len(arrays[0]), arrays[2]
         remembers = state is None and episode_start is None
-        nothing = self._empty_context(n_rows)
-        before = check_context(state, nothing) if state is not None else None
         if episode_start is not None:
             episode_start = _check_episode_start(episode_start, n_rows)
-        if remembers:
-            before = self._remembered.recall(arrays[0], timestep)
-        if before is None:
-            before = nothing
-        if before.plan.shape != nothing.plan.shape:  # another number of steps was planned then
-            before = before._replace(plan=nothing.plan, n_planned=nothing.n_planned)
+        before = self._known(self._remembered.recall(arrays[0], timestep) if remembers else state, n_rows)
         lost = restarts(before, timestep) & (timestep > 0)
         if episode_start is not None:
             lost &= ~episode_start
@@ -388,6 +382,99 @@ class SequencePolicy(BasePolicy):
             self._remembered.remember(before, context)
         action = self._to_environment(context.actions[:, -1])
         return action if vectorized else action.squeeze(axis=0), tuple(context)
+
+    def _known(self, state: tuple[np.ndarray, ...] | None, n_rows: int) -> Context:
+        """The context to go on from; a plan for another number of steps than are planned now is dropped."""
+        nothing = self._empty_context(n_rows)
+        if state is None:
+            return nothing
+        before = check_context(state, nothing)
+        if before.plan.shape != nothing.plan.shape:
+            before = before._replace(plan=nothing.plan, n_planned=nothing.n_planned)
+        return before
+
+    def look(
+        self,
+        observation: dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+    ) -> tuple[Context, th.Tensor]:
+        """
+        The first half of acting, for a caller who chooses the noise: :meth:`act_from_noise` is the second one.
+
+        A pure function, as `predict` with a `state`.
+
+        :param observation: as for :meth:`predict`
+        :param state: what :meth:`act_from_noise` or :meth:`predict` returned; None for no past
+        :param episode_start: (B,) bool, True where an environment was just reset
+        :return: the context with the newest step, and the trunk's hidden states (B, D)
+        :raises ValueError: as :meth:`predict`
+        """
+        arrays, _ = unpack_observation(observation, self.observation_dim)
+        n_rows = len(arrays[0])
+        if episode_start is not None:
+            episode_start = _check_episode_start(episode_start, n_rows)
+        context = push(self._known(state, n_rows), *arrays, episode_start=episode_start)
+        self._stop_training()
+        with th.inference_mode():
+            hidden, keys_values = self._hidden(context, np.ones(n_rows, bool))
+        assert hidden is not None
+        return context._replace(keys_values=keys_values), hidden
+
+    def act_from_noise(self, context: Context, hidden: th.Tensor, noise: np.ndarray) -> tuple[np.ndarray, Context]:
+        """
+        The second half: what this noise leads to. Whatever was planned before is dropped.
+
+        :param context: what :meth:`look` returned, with `hidden`
+        :param hidden: (B, D)
+        :param noise: (B, N), for the head's `noise_dim`
+        :return: actions of this step and of those planned, (B, n_action_steps, A) in the environment's range, and the next
+            `state`; until it is `look`'s turn again, `predict` gives the planned ones
+        :raises ValueError: noise that leads to no finite action
+        """
+        with th.inference_mode():
+            chunks = self._to_chunks(self._decode(hidden, th.as_tensor(noise, dtype=th.float32, device=hidden.device)))
+        context = self._carry_out(context, np.ones(len(noise), bool), chunks)
+        planned = np.concatenate([context.actions[:, -1:], context.plan], axis=1)
+        return self._to_environment(planned), context
+
+    def steering_observation(
+        self, windows: Windows, hidden: th.Tensor | None, rows: np.ndarray | slice = slice(None)
+    ) -> th.Tensor:
+        """
+        What noise is chosen by, see :func:`~sb3_dtfm.policies.steering.steering_observation`.
+
+        :param windows: arrays (B, K, ...) in the environment's units; the newest step is read
+        :param hidden: (b, D), None to leave it out
+        :param rows: b of the B rows; all by default
+        :return: (b, F)
+        """
+        newest = Windows(*(th.from_numpy(each[rows, -1:]).to(self.device) for each in windows))
+        return steering_observation(self.normalization, newest, hidden)
+
+    def check_steerable(self) -> int:
+        """
+        :return: N, numbers of the noise that somebody else may choose
+        :raises ValueError: there is no flow
+        """
+        head = self.network.head
+        if not head.noise_dim or not isinstance(self.action_space, spaces.Box):
+            name = type(self).__name__.removesuffix("Policy")
+            raise ValueError(f"{name} of {self.action_space} has no flow whose noise could be chosen; a DTFM is needed.")
+        return head.noise_dim
+
+    def set_steering(self, settings: dict[str, Any] | None) -> None:
+        """
+        Let a network choose the noise from now on; its weights are for the caller to load.
+
+        :param settings: of :class:`~sb3_dtfm.policies.steering.Steering`; None draws noise again
+        :raises ValueError: the head starts from no noise, or a setting out of range
+        """
+        if settings is None:
+            self.steering = None
+            return
+        steering = make_steering(self.observation_dim, self.network.trunk.embed_dim, self.check_steerable(), settings)
+        self.steering = steering.to(self.device).requires_grad_(False)
 
     def reset(self) -> None:
         """Forget the context that `predict` remembers for a caller who passes no `state`."""
@@ -409,14 +496,27 @@ class SequencePolicy(BasePolicy):
 
         :raises ValueError: they would not be finite
         """
-        if self.training:
-            self.set_training_mode(False)  # goes through all modules
+        self._stop_training()
         due = context.n_planned == 0
         with th.inference_mode():
             chunks, keys_values = self._choose(context, due, deterministic)
+        return self._carry_out(context, due, chunks)._replace(keys_values=keys_values)
+
+    def _stop_training(self) -> None:
+        if self.training:
+            self.set_training_mode(False)  # goes through all modules
+
+    def _carry_out(self, context: Context, due: np.ndarray, chunks: np.ndarray) -> Context:
+        """
+        The newest step's actions, and plans for the next ones.
+
+        :param due: (B,) bool, b rows that have new actions
+        :param chunks: (b, H, A) in [-1, 1]
+        :raises ValueError: they are not finite
+        """
         if not (fits := np.isfinite(chunks)).all():
             self._refuse(context, np.flatnonzero(due)[~fits.all(axis=(1, 2))])
-        return with_plan(context, due, chunks[:, : self.n_action_steps])._replace(keys_values=keys_values)
+        return with_plan(context, due, chunks[:, : self.n_action_steps])
 
     @staticmethod
     def _refuse(context: Context, rows: np.ndarray) -> NoReturn:
@@ -440,30 +540,44 @@ class SequencePolicy(BasePolicy):
         :param due: (B,) bool, rows that need new actions, b of them
         :return: (b, H, A) in [-1, 1], and the keys and values to keep, which grow with each step, due or not
         """
+        hidden, keys_values = self._hidden(context, due)
+        if hidden is None:
+            return np.zeros((0, self.chunk_size, self.action_dim), np.float32), keys_values
+        rows = context.timesteps[due, -1] + context.episode_keys[due]
+        if self.n_candidates > 1 and self.steering is None:
+            observations = th.from_numpy(context.observations[due, -1]).to(hidden.device)
+            candidates, chosen = self._draw_candidates(hidden, observations, rows, deterministic)
+            return self._to_chunks(candidates[th.arange(len(chosen), device=hidden.device), chosen]), keys_values
+        noise = self._acting_noise(rows, deterministic).to(hidden.device)
+        if self.steering is not None:
+            shown = self.steering_observation(context.windows, hidden if self.steering.hidden_state else None, due)
+            noise = self.steering(shown, noise)
+        return self._to_chunks(self._decode(hidden, noise)), keys_values
+
+    def _hidden(self, context: Context, due: np.ndarray) -> tuple[th.Tensor | None, np.ndarray]:
+        """
+        :param due: (B,) bool, rows that need new actions, b of them
+        :return: hidden states (b, D) of the newest steps, None where none is due; and the keys and values to keep, which
+            grow with each step, due or not
+        """
         caches = self.kv_cache and self.context_length > 1
-        nothing = np.zeros((0, self.chunk_size, self.action_dim), np.float32)
         keys_values = np.zeros((len(due), 0), np.float32)
         if not caches and not due.any():
-            return nothing, keys_values
+            return None, keys_values
         device = self.device  # SB3 looks for it among the parameters each time
-        network = self.acting_network
         windows = Windows(*(th.from_numpy(each if caches else each[due]).to(device) for each in context.windows))
-        if caches:
-            hidden, keys_values = self._extend(self.normalization(windows), context.keys_values)
-            if not due.any():
-                return nothing, keys_values
-            hidden = hidden[th.from_numpy(due).to(device)]
-        else:
-            hidden = self.hidden_states(network, windows, last_only=True).squeeze(1)
-        rows = context.timesteps[due, -1] + context.episode_keys[due]
-        if self.n_candidates == 1:
-            noise = self._acting_noise(rows, deterministic).to(device)
-            actions = network.head(hidden, noise).clamp(-1.0, 1.0)
-        else:
-            observations = th.from_numpy(context.observations[due, -1]).to(device)
-            candidates, chosen = self._draw_candidates(hidden, observations, rows, deterministic)
-            actions = candidates[th.arange(len(chosen), device=device), chosen]
-        return actions.cpu().numpy().reshape(-1, self.chunk_size, self.action_dim), keys_values
+        if not caches:
+            return self.hidden_states(self.acting_network, windows, last_only=True).squeeze(1), keys_values
+        hidden, keys_values = self._extend(self.normalization(windows), context.keys_values)
+        return (hidden[th.from_numpy(due).to(device)] if due.any() else None), keys_values
+
+    def _decode(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        """From hidden states (b, D) and noise (b, N) to chunks (b, H A) in [-1, 1]."""
+        return self.acting_network.head(hidden, noise).clamp(-1.0, 1.0)
+
+    def _to_chunks(self, actions: th.Tensor) -> np.ndarray:
+        """From (b, H A) to (b, H, A) on the CPU."""
+        return actions.cpu().numpy().reshape(-1, self.chunk_size, self.action_dim)
 
     def _draw_candidates(
         self, hidden: th.Tensor, observations: th.Tensor, rows: np.ndarray, deterministic: bool
@@ -479,8 +593,7 @@ class SequencePolicy(BasePolicy):
         assert self.critic is not None
         n, turns = self.n_candidates, np.arange(self.n_candidates)
         noise = self._acting_noise((rows[:, None] + CANDIDATE_STRIDE * turns).ravel(), deterministic).to(hidden.device)
-        candidates = self.acting_network.head(hidden.repeat_interleave(n, dim=0), noise).clamp(-1.0, 1.0)
-        candidates = candidates.view(len(hidden), n, -1)
+        candidates = self._decode(hidden.repeat_interleave(n, dim=0), noise).view(len(hidden), n, -1)
         chance = self._acting_noise((rows[:, None] + CHOICE_START + CHOICE_STRIDE * turns).ravel(), deterministic)
         uniform = th.special.ndtr(chance[:, 0]).clamp(1e-6, 1 - 1e-6).view(len(hidden), n).to(hidden.device)
         states = self.normalization.scale_observation(observations).unsqueeze(1).expand(-1, n, -1)
@@ -500,15 +613,6 @@ class SequencePolicy(BasePolicy):
             rows = th.randint(NOISE_ROWS, (len(hidden),), generator=generator, device=generator.device).cpu().numpy()
             _, chosen = self._draw_candidates(hidden, batch.observations[:, -1], rows, deterministic=True)
             return (chosen != 0).float().mean()
-
-    def scaled_transitions(self, batch: Transitions) -> Transitions:
-        """Those of a buffer as the critic takes them: observations normalised, actions in [-1, 1]."""
-        actions = batch.actions.view(len(batch.actions), -1, self.action_dim)
-        return batch._replace(
-            observations=self.normalization.scale_observation(batch.observations),
-            next_observations=self.normalization.scale_observation(batch.next_observations),
-            actions=self.normalization.scale_action(actions).flatten(1),
-        )
 
     def _extend(self, windows: Windows, kept: np.ndarray) -> tuple[th.Tensor, np.ndarray]:
         """
