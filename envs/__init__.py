@@ -7,6 +7,7 @@ from sb3_dtfm.envs.robotics import register_gymnasium_robotics
 
 if TYPE_CHECKING:
     from sb3_dtfm.envs.return_to_go import (
+        BETWEEN,
         OBSERVATION,
         RETURN_TO_GO,
         TIMESTEP,
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 register_robosuite_envs()
 
 __all__ = [
+    "BETWEEN",
     "OBSERVATION",
     "RETURN_TO_GO",
     "TIMESTEP",

@@ -12,6 +12,8 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, is_vecenv_wr
 OBSERVATION = "observation"
 RETURN_TO_GO = "return_to_go"
 TIMESTEP = "timestep"
+# In `info` after several actions: what was observed between them.
+BETWEEN = "observations_between"
 
 
 def sort_observation_space(space: spaces.Space) -> spaces.Space:
@@ -95,6 +97,10 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     float64 and shown as float32, in environment reward units; scaling is the policy's business. A Dict observation
     (goal-conditioned tasks, for example) is flattened to one vector, see :func:`flatten_observation_space`.
 
+    `step` also takes several actions, (N, A): they are carried out one after the other until the episode ends, rewards are
+    added up, and `info` has the observations between them, stacked by key, under `BETWEEN`. So whoever decides once for
+    several steps does so in each of many parallel environments at its own place in its episode.
+
     :param env: the environment to wrap
     :param target_return: return to ask for in each episode, environment reward units
     :raises ValueError: `target_return` is not a finite number, or the observation space cannot be flattened
@@ -127,10 +133,26 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return self._observe(observation), info
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
+        if np.ndim(action) > len(self.env.action_space.shape or ()):
+            return self._step_through(action)
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._return_to_go -= float(reward)
         self._timestep += 1
         return self._observe(observation), reward, terminated, truncated, info
+
+    def _step_through(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
+        """:param actions: (N, A)"""
+        observations, total, terminated, truncated = [], 0.0, False, False
+        info: dict[str, Any] = {}
+        for action in actions:
+            observation, reward, terminated, truncated, info = self.step(action)
+            observations.append(observation)
+            total += float(reward)
+            if terminated or truncated:
+                break
+        *between, last = observations
+        info = {**info, BETWEEN: {key: np.array([each[key] for each in between]) for key in last}}
+        return last, total, terminated, truncated, info
 
     def _observe(self, observation: Any) -> dict[str, np.ndarray]:
         return {

@@ -15,20 +15,14 @@ from pathlib import Path
 import gymnasium as gym
 import minari
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from mazes import ENV_ID, Path2D, draw, model_paths
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_dtfm import DT, DTFM
-from sb3_dtfm.benchmark.evaluation import FINAL_STATES
-from sb3_dtfm.envs import ReturnToGoWrapper, register_gymnasium_robotics
 from sb3_dtfm.recording.agent import episode_seeds
 from sb3_dtfm.recording.episodes import EpisodeRecorder, run_episodes
 from sb3_dtfm.recording.minari import check_dataset_id, write_minari
 
-register_gymnasium_robotics()
-ENV_ID = "PointMaze_UMaze-v3"
 ENV_KWARGS = {
     "maze_map": [[1, 1, 1, 1, 1], [1, 0, "g", 0, 1], [1, 0, 1, 0, 1], [1, 0, "r", 0, 1], [1, 1, 1, 1, 1]],
     "continuing_task": False,
@@ -74,42 +68,16 @@ def record(n_episodes: int) -> None:
     print(f"{dataset.id}: {n_episodes} episodes, {reached:.0%} reach the goal, {dataset.total_steps} steps")
 
 
-def model_paths(model: BaseAlgorithm, n_episodes: int) -> list[np.ndarray]:
-    """Positions (T + 1, 2) of the ball in each episode, in metres; acting deterministically."""
-    env = ReturnToGoWrapper(gym.make(ENV_ID, **ENV_KWARGS), target_return=1.0)
-    paths = []
-    for seed in range(FINAL_STATES, FINAL_STATES + n_episodes):
-        observation, _ = env.reset(seed=seed)
-        state, start, over, path = None, np.ones(1, bool), False, []
-        while not over:
-            path.append(observation["observation"][:2])
-            action, state = model.predict(observation, state, start, deterministic=True)
-            observation, _, terminated, truncated, _ = env.step(action)
-            over, start = terminated or truncated, np.zeros(1, bool)
-        paths.append(np.array([*path, observation["observation"][:2]]))
-    return paths
-
-
 def plot(models: dict[str, BaseAlgorithm], n_episodes: int, output: Path) -> None:
     """Draw the ways of demonstrations and models, those that did not arrive in red."""
     dataset = minari.load_dataset(DATASET_ID)
-    demonstrated = [episode.observations["achieved_goal"] for episode in dataset.iterate_episodes(range(n_episodes))]
-    panels = {"demonstrations": demonstrated, **{name: model_paths(model, n_episodes) for name, model in models.items()}}
-    figure = Figure(figsize=(3.0 * len(panels), 3.3), layout="constrained")
-    FigureCanvasAgg(figure)
-    for axis, (name, paths) in zip(figure.subplots(1, len(panels)), panels.items(), strict=True):
-        arrived = [len(path) <= ENV_KWARGS["max_episode_steps"] for path in paths]
-        for path, there in sorted(zip(paths, arrived, strict=True), key=lambda each: not each[1]):
-            axis.plot(*path.T, color="#0072B2" if there else "#D55E00", linewidth=0.9, alpha=0.7, zorder=3 - there)
-        axis.add_patch(Rectangle((-0.5, -0.5), 1, 1, color="0.75"))
-        axis.add_patch(Rectangle((-1.5, -1.5), 3, 3, fill=False, color="0.75", linewidth=6))
-        for cell, place in (((0, -1.42), "start"), ((0, 1.3), "goal")):
-            axis.text(*cell, place, ha="center", color="0.45")
-        axis.set(title=f"{name}: {sum(arrived)} of {len(paths)} arrive", xticks=[], yticks=[], aspect="equal")
-        axis.set_frame_on(False)
-    output.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(output, dpi=150)
-    print(output)
+    demonstrated = [
+        Path2D(episode.observations["achieved_goal"], bool(episode.terminations[-1]))
+        for episode in dataset.iterate_episodes(range(n_episodes))
+    ]
+    panels = {"demonstrations": demonstrated}
+    panels |= {name: model_paths(model, ENV_KWARGS, n_episodes) for name, model in models.items()}
+    draw(panels, ENV_KWARGS["maze_map"], {"start": (0, -1.42), "goal": (0, 1.3)}, output)
 
 
 def main() -> None:

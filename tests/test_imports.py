@@ -45,9 +45,16 @@ ROOMS = {
             "files",
         },
     ),
-    "zoo": ("sb3_dtfm/zoo", {"", "algorithms", "arguments", "policies", "callbacks", "envs", "distributed", "files", "zoo"}),
+    "finetuning": ("sb3_dtfm/finetuning", {"finetuning", "algorithms", "arguments", "envs", "policies", "windows"}),
+    "zoo": (
+        "sb3_dtfm/zoo",
+        {"", "algorithms", "arguments", "policies", "callbacks", "envs", "distributed", "files", "finetuning", "zoo"},
+    ),
     "benchmark": ("sb3_dtfm/benchmark", {"", "algorithms", "data", "envs", "zoo", "benchmark", "files"}),
-    "cli": ("sb3_dtfm/cli", {"", "actions", "algorithms", "data", "envs", "recording", "zoo", "benchmark", "files", "cli"}),
+    "cli": (
+        "sb3_dtfm/cli",
+        {"", "actions", "algorithms", "data", "envs", "finetuning", "recording", "zoo", "benchmark", "files", "cli"},
+    ),
 }
 
 

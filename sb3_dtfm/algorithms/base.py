@@ -18,6 +18,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dtfm.actions import ActionSpace, bounds_of
 from sb3_dtfm.algorithms.saving import (
+    CRITIC_OPTIMIZER,
+    CRITIC_PREFIX,
     OPTIMIZER,
     POLICY,
     UnsavedSchedule,
@@ -184,6 +186,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
             normalization.set_statistics(*buffer.statistics())
             if normalization.return_to_go_range is not None:
                 normalization.set_return_to_go_range(buffer.return_to_go_range())
+            if self.policy.critic is not None:
+                self.policy.critic.set_scale(buffer.largest_discounted_return(self.policy.gamma))
 
     def _check_arguments(self, learning_rate: Rule) -> None:
         """
@@ -396,8 +400,18 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
 
     def _parameters(self, tensors: dict[str, dict[str, th.Tensor]], source: str) -> Any:
         """What :meth:`set_parameters` takes, from the tensors of a file."""
-        optimizer = optimizer_state(self.policy.optimizer, tensors[OPTIMIZER], source)
-        return {POLICY: tensors[POLICY], OPTIMIZER: optimizer}
+        loaded: dict[str, Any] = {POLICY: tensors[POLICY]}
+        states = dict(tensors[OPTIMIZER])
+        for name, (optimizer, prefix) in reversed(self._optimizers().items()):  # all that are not the critic's: the policy's
+            own = {key[len(prefix) :]: states.pop(key) for key in list(states) if key.startswith(prefix)}
+            loaded[name] = optimizer_state(optimizer, own, source)
+        return loaded
+
+    def _optimizers(self) -> dict[str, tuple[th.optim.Optimizer, str]]:
+        """By the name that SB3 finds them by, each with how the names of its tensors begin in a file."""
+        critic = self.policy.critic
+        own = {OPTIMIZER: (self.policy.optimizer, "")}
+        return own if critic is None else {**own, CRITIC_OPTIMIZER: (critic.optimizer, CRITIC_PREFIX)}
 
     def set_parameters(
         self,
@@ -442,7 +456,9 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         wanted = set(include or ())
         left_out = {*self._excluded_save_params(), *(exclude or ())} - wanted
         parameters = self.get_parameters()
-        tensors = {POLICY: parameters[POLICY], OPTIMIZER: optimizer_tensors(self.policy.optimizer)}
+        tensors = {POLICY: parameters[POLICY], OPTIMIZER: {}}
+        for optimizer, prefix in self._optimizers().values():
+            tensors[OPTIMIZER] |= {f"{prefix}{name}": value for name, value in optimizer_tensors(optimizer).items()}
         write_model(path, ModelFile(to_configuration(self, left_out, wanted), tensors))
         self._last_saved = file_name(path)
 
@@ -485,4 +501,4 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         return [*super()._excluded_save_params(), *of_an_environment, *made_anew]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return [POLICY, OPTIMIZER], []
+        return [POLICY, *self._optimizers()], []

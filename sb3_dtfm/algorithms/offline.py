@@ -5,7 +5,7 @@ import itertools
 import math
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import torch as th
@@ -21,6 +21,7 @@ from sb3_dtfm.optimization import (
     BATCHES,
     DROPOUT,
     NOISE,
+    TRANSITIONS,
     RunningMeans,
     autocast,
     learning_rate_factor,
@@ -31,6 +32,8 @@ from sb3_dtfm.windows import Windows
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineSequenceAlgorithm")
 
+# What has to be finite of what is logged.
+FINITE = ("loss", "grad_norm", "critic_loss")
 # Episodes that a message shows at most.
 N_EPISODES_SHOWN = 50
 
@@ -168,17 +171,30 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         loss, parts = parallel.compute_loss(batch, *self.policy.draw_noise(batch, generator))
         loss.backward()
         grad_norm = th.nn.utils.clip_grad_norm_(self.policy.clipped_parameters(), self.max_grad_norm or math.inf)
-        means = parallel.mean({"loss": loss, "grad_norm": grad_norm, **parts})
+        means = parallel.mean({"loss": loss, "grad_norm": grad_norm, **parts, **self._learn_values()})
         self._means.add(means)
         # The fused optimiser leaves the weights alone where this is 1, and no host has to wait for a GPU to tell.
         optimizer.found_inf = (~th.isfinite(means["loss"] + means["grad_norm"])).float().detach()
         optimizer.step()
         self._n_updates += 1
         if self.device.type == "cpu":
-            self._check_finite({name: float(means[name].detach()) for name in ("loss", "grad_norm")})
+            self._check_finite({name: float(means[name].detach()) for name in FINITE if name in means})
         if self.ema_decay > 0:
             # A young average follows more closely, or the random start would stay in it for long.
             self.policy.update_ema(min(self.ema_decay, (1 + self._n_updates) / (10 + self._n_updates)))
+
+    def _learn_values(self) -> dict[str, th.Tensor]:
+        """The critic's gradient steps, the same on every process; what is logged of the last one."""
+        critic = self.policy.critic
+        if critic is None:
+            return {}
+        assert self.buffer is not None
+        assert self._training_seed is not None
+        generator = th.Generator(self.device).manual_seed(step_seed(self._training_seed, self._n_updates, TRANSITIONS))
+        for _ in range(self.policy.critic_steps):
+            batch = self.buffer.sample_transitions(critic.batch_size, self.policy.n_valued, self.policy.gamma, generator)
+            parts = critic.learn(self.policy.normalization.scale_transitions(batch))
+        return parts
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         remaining = self._current_progress_remaining
@@ -221,7 +237,7 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         :param n_steps: how many these are
         :raises FloatingPointError: the loss or its gradient is no longer finite
         """
-        for name in ("loss", "grad_norm"):
+        for name in FINITE:
             if not math.isfinite(means.get(name, 0.0)):
                 raise FloatingPointError(
                     f"The {name} became {means[name]} {self._name_steps(n_steps)}. Such steps change no weight, so the last "
@@ -260,7 +276,9 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
     def _log(self, means: dict[str, float]) -> None:
         for name, mean in means.items():
             self.logger.record(f"train/{name}", mean)
-        self.logger.record("train/action_mse", self._training_action_mse())
+        self.logger.record("train/action_mse", self._on_training_windows(self.policy.action_mse))
+        if self.policy.n_candidates > 1:
+            self.logger.record("train/guided_share", self._on_training_windows(self.policy.guided_share))
         self.logger.record("train/learning_rate", self._current_learning_rate)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("time/steps_per_second", self._timed_steps / self._training_seconds)
@@ -268,9 +286,8 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(step=self.num_timesteps)
 
-    def _training_action_mse(self) -> float:
-        """`train/action_mse` on windows of the training data that belong to the step, so that it disturbs nothing."""
+    def _on_training_windows(self, measure: Callable[[Windows, th.Generator], th.Tensor]) -> float:
+        """Something measured on windows of the training data that belong to the step, so that it disturbs nothing."""
         assert self.buffer is not None
         generator = th.Generator(self.device).manual_seed(self.num_timesteps)
-        batch = self.buffer.sample(self.batch_size, self.context_length, generator)
-        return float(self.policy.action_mse(batch, generator))
+        return float(measure(self.buffer.sample(self.batch_size, self.context_length, generator), generator))

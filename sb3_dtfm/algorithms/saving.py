@@ -22,7 +22,8 @@ from sb3_dtfm.files import ModelFileError
 from sb3_dtfm.optimization import RunningMeans
 from sb3_dtfm.policies import SequencePolicy
 
-POLICY, OPTIMIZER = "policy", "policy.optimizer"
+POLICY, OPTIMIZER, CRITIC_OPTIMIZER = "policy", "policy.optimizer", "policy.critic.optimizer"
+CRITIC_PREFIX = "critic."  # of the names of the critic's tensors among the optimiser's
 SPACES = ("observation_space", "action_space")
 # Attributes that have a form of their own in the file.
 ENCODED = (*SPACES, "policy_class", "learning_rate", "_means")
@@ -36,6 +37,14 @@ COUNTERS: dict[str, Rule] = {
     "n_envs": COUNT,
     "max_timestep": COUNT,
     "verbose": WHOLE,
+}
+# Of the policy's tensors.
+POSITIVE_BUFFERS = {
+    "normalization.observation_std",
+    "normalization.observation_gain",
+    "normalization.return_scale",
+    "critic.reward_scale",
+    "critic.spread",
 }
 # The optimiser's state of a weight: its own shape, or a number.
 MOMENTS = {"step": False, "exp_avg": True, "exp_avg_sq": True}
@@ -297,8 +306,8 @@ def check_policy(policy: SequencePolicy, tensors: Mapping[str, th.Tensor], sourc
             _check_shape(tensors[name], tensor.shape, f"{source}: {POLICY} {name}")
     unlimited = "normalization.return_to_go_range"
     _check_finite({name: tensor for name, tensor in tensors.items() if name != unlimited}, f"{source}: {POLICY}")
-    for name in ("observation_std", "observation_gain", "return_scale"):
-        if not bool((tensors[f"normalization.{name}"] > 0).all()):
-            raise ModelFileError(f"{source}: {POLICY} normalization.{name} must be positive.")
+    for name in POSITIVE_BUFFERS & tensors.keys():
+        if not bool((tensors[name] > 0).all()):
+            raise ModelFileError(f"{source}: {POLICY} {name} must be positive.")
     if unlimited in tensors and not bool((tensors[unlimited][0] <= tensors[unlimited][1]).all()):
         raise ModelFileError(f"{source}: {POLICY} {unlimited}: the smallest must not be above the largest.")

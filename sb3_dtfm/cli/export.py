@@ -7,6 +7,7 @@ from pathlib import Path
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.cli.literals import key_value
 from sb3_dtfm.files import read_configuration
+from sb3_dtfm.finetuning import SteeredDTFM
 
 
 def main(argv: Sequence[str]) -> None:
@@ -33,10 +34,12 @@ def main(argv: Sequence[str]) -> None:
     )
     options = parser.parse_args(argv)
     path = find_model(options.model)
-    algorithm = str(read_configuration(path).get("algorithm"))
+    configuration = read_configuration(path)
+    algorithm = str(configuration.get("algorithm"))
     if algorithm.lower() not in ALGORITHMS:
         raise ValueError(f"{path} was saved by {algorithm}; {' and '.join(ALGORITHMS)} can be exported.")
-    model = ALGORITHMS[algorithm.lower()].load(path, device="cpu")
+    steered = dict(configuration.get("attributes") or {}).get("steering") is not None
+    model = (SteeredDTFM if steered else ALGORITHMS[algorithm.lower()]).load(path, device="cpu")
     model.policy.set_acting(**dict(options.acting))
     model.export(options.output, options.env, options.target_return)
     print(f"Policy: {options.output}")

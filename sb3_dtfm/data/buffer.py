@@ -24,7 +24,7 @@ from sb3_dtfm.data.trajectories import (
     check_trajectory,
 )
 from sb3_dtfm.files import replacing
-from sb3_dtfm.windows import Windows
+from sb3_dtfm.windows import Transitions, Windows
 
 # A buffer moves to an accelerator if it takes at most this share of the memory that is free there.
 DEVICE_MEMORY_SHARE = 0.5
@@ -93,6 +93,7 @@ class TrajectoryBuffer:
         self._stops = th.from_numpy(stops).to(self.observations.device)
         self._firsts = th.from_numpy(stops - episodes.lengths).to(self.observations.device)
         self._starts = th.from_numpy(episodes.starts).to(self.observations.device)
+        self._terminated = th.from_numpy(episodes.terminated).to(self.observations.device)
         self._n_steps = int(stops[-1])
 
     @classmethod
@@ -246,6 +247,23 @@ class TrajectoryBuffer:
         low = th.full((n_timesteps,), th.inf).scatter_reduce_(0, timesteps, values, "amin")
         high = th.full((n_timesteps,), -th.inf).scatter_reduce_(0, timesteps, values, "amax")
         return th.stack((low, high))
+
+    def largest_discounted_return(self, gamma: float) -> float:
+        """
+        Largest absolute discounted return-to-go, over the buffer's own episodes; reads 4 bytes a step.
+
+        :param gamma: discount of a step
+        :return: environment reward units
+        """
+        largest = 0.0
+        for start, length in zip(self.episodes.starts, self.episodes.lengths, strict=True):
+            to_go = self.rewards[start : start + length].cpu().numpy().astype(np.float64)
+            n_summed = 1  # steps that each sum has
+            while n_summed < length:
+                to_go[:-n_summed] += gamma**n_summed * to_go[n_summed:]
+                n_summed *= 2
+            largest = max(largest, float(np.abs(to_go).max()))
+        return largest
 
     def check_task(self, env_id: str) -> None:
         """
@@ -451,6 +469,46 @@ class TrajectoryBuffer:
         :param generator: source of randomness
         """
         return self.windows(self._draw(batch_size, generator), context_length)
+
+    def sample_transitions(
+        self, batch_size: int, n_steps: int, gamma: float, generator: th.Generator | None = None
+    ) -> Transitions:
+        """
+        Steps of any episode with equal probability, and where they and those after them led to.
+
+        :param batch_size: B
+        :param n_steps: h, steps that count as one
+        :param gamma: discount of a step
+        :param generator: source of randomness
+        """
+        return self.transitions(self._draw(batch_size, generator), n_steps, gamma)
+
+    def transitions(self, positions: th.Tensor, n_steps: int, gamma: float) -> Transitions:
+        """
+        The steps at the given positions, and where they and those after them led to; actions in the environment's range.
+
+        Behind an episode's end its last action stands again and again, as in :meth:`windows`.
+
+        :param positions: (B,) int64 among the buffer's own steps, episode after episode
+        :param n_steps: h, steps that count as one
+        :param gamma: discount of a step
+        """
+        positions = positions.to(self._stops.device)
+        rows, _, n_left = self._locate(positions)
+        terminated = self._terminated[th.searchsorted(self._stops, positions, right=True)]
+        steps = th.arange(n_steps, device=rows.device)
+        ahead = (rows.unsqueeze(1) + th.minimum(steps, n_left.unsqueeze(1))).flatten()
+        discounted = self.rewards.index_select(0, ahead).view(-1, n_steps) * gamma**steps
+        goes_on = n_left >= n_steps
+        batch = Transitions(
+            observations=self.observations.index_select(0, rows),
+            actions=self.actions.index_select(0, ahead).view(len(rows), -1),
+            rewards=(discounted * (steps <= n_left.unsqueeze(1))).sum(dim=1),
+            next_observations=self.observations.index_select(0, rows + th.minimum(steps[-1] + 1, n_left)),
+            discounts=gamma**n_steps * goes_on,
+            mask=goes_on | terminated,
+        )
+        return Transitions(*(tensor.to(self.device) for tensor in batch))
 
     def _episode_weights(self, return_weight: float) -> th.Tensor:
         """(E,) float32, with what probability an episode is drawn, up to a factor: by its length, its weight, its return."""

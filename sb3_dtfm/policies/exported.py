@@ -10,6 +10,7 @@ from torch.nn import functional as F
 
 from sb3_dtfm.policies.normalization import Normalization
 from sb3_dtfm.policies.sequence import SequenceNetwork, SequencePolicy
+from sb3_dtfm.policies.steering import steering_observation
 from sb3_dtfm.windows import Windows
 
 
@@ -23,14 +24,21 @@ class ExportedPolicy(nn.Module):
     Actions of a Discrete space are vectors here: 1 for the choice, 0 for the others.
 
     :param policy: stays as it is; what acts of it is copied to the CPU
+    :raises ValueError: its critic would choose among several draws
     """
 
     noise_table: th.Tensor
 
     def __init__(self, policy: SequencePolicy) -> None:
         super().__init__()
+        if policy.n_candidates > 1:
+            raise ValueError(
+                f"n_candidates={policy.n_candidates}: a choice by the critic is not exported; `n_candidates:1` among the "
+                "ways of acting exports the flow alone."
+            )
         self.normalization: Normalization = copy.deepcopy(policy.normalization).cpu()
         self.network: SequenceNetwork = copy.deepcopy(policy.acting_network).cpu()
+        self.steering = copy.deepcopy(policy.steering).cpu() if policy.steering is not None else None
         self.register_buffer("noise_table", policy.noise_table.cpu())
         self.context_length = policy.context_length
         self.keeps = policy.kv_cache and policy.context_length > 1
@@ -87,6 +95,10 @@ class ExportedPolicy(nn.Module):
         else:
             rows = (timesteps[:, -1] + episode_keys) % len(self.noise_table)
             noise = th.where(noise.any(dim=1, keepdim=True), noise, self.noise_table[rows])
+        if self.steering is not None:
+            newest = Windows(*(each[:, -1:] for each in (observations, scaled, returns_to_go, timesteps, mask)))
+            shown = steering_observation(self.normalization, newest, hidden if self.steering.hidden_state else None)
+            noise = self.steering(shown, noise)
         chunk = head(hidden, noise).clamp(-1.0, 1.0).unflatten(1, (-1, self.settings["action_dim"]))
         return self.normalization.unscale_action(chunk), *kept
 

@@ -7,7 +7,7 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_dtfm.windows import Windows
+from sb3_dtfm.windows import Transitions, Windows
 
 # Observations are clipped at this many standard deviations, as SB3's VecNormalize does.
 OBSERVATION_CLIP = 10.0
@@ -96,7 +96,6 @@ class Normalization(nn.Module):
         :param windows: tensors; observations and returns-to-go as the environment gives them
         :return: observations normalised and clipped, returns-to-go scaled to about 1 and clipped, the others as they are
         """
-        observations = (windows.observations - self.observation_mean) / self.observation_std
         returns_to_go = windows.returns_to_go
         if self.return_to_go_range is not None:
             low, high = self.return_to_go_range[:, windows.timesteps.clamp(max=self.max_timestep - 1)]
@@ -105,8 +104,22 @@ class Normalization(nn.Module):
             remaining = (self.max_timestep - windows.timesteps).clamp(min=1)
             returns_to_go = returns_to_go * (self.max_timestep / remaining)
         return windows._replace(
-            observations=observations.clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP) * self.observation_gain,
+            observations=self.scale_observation(windows.observations),
             returns_to_go=(returns_to_go / self.return_scale).clamp(-RETURN_TO_GO_CLIP, RETURN_TO_GO_CLIP),
+        )
+
+    def scale_observation(self, observations: th.Tensor) -> th.Tensor:
+        """Normalised and clipped, (..., O)."""
+        scaled = (observations - self.observation_mean) / self.observation_std
+        return scaled.clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP) * self.observation_gain
+
+    def scale_transitions(self, batch: Transitions) -> Transitions:
+        """Those of a buffer as a critic takes them: observations normalised, actions in [-1, 1]."""
+        actions = batch.actions.view(len(batch.actions), -1, len(self.action_low))
+        return batch._replace(
+            observations=self.scale_observation(batch.observations),
+            next_observations=self.scale_observation(batch.next_observations),
+            actions=self.scale_action(actions).flatten(1),
         )
 
     def scale_action(self, action: Any) -> Any:

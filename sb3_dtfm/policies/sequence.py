@@ -26,12 +26,26 @@ from sb3_dtfm.arguments import (
     with_nearest,
 )
 from sb3_dtfm.heads import ActionHead
+from sb3_dtfm.heads.base import NOISE_ROWS
 from sb3_dtfm.networks.cpu import hand_out, take_up
 from sb3_dtfm.networks.trunk import SequenceTrunk
+from sb3_dtfm.policies.critic import Critic
 from sb3_dtfm.policies.memory import RememberedContext
 from sb3_dtfm.policies.normalization import Normalization
-from sb3_dtfm.windows import Context, Windows, check_context, empty_context, push, restarts, unpack_observation, with_plan
+from sb3_dtfm.policies.steering import Steering, make_steering, steering_observation
+from sb3_dtfm.windows import (
+    Context,
+    Windows,
+    check_context,
+    empty_context,
+    push,
+    restarts,
+    unpack_observation,
+    with_plan,
+)
 
+# How far apart in the noise table the candidates' rows lie, and those that chance chooses by: no divisors of its length.
+CANDIDATE_STRIDE, CHOICE_STRIDE, CHOICE_START = 97, 31, 513
 ACCEPTED: dict[str, Rule] = {
     "context_length": COUNT,
     "max_timestep": COUNT,
@@ -48,6 +62,9 @@ ACCEPTED: dict[str, Rule] = {
     "film_return_to_go": BOOLEAN,
     "calm_units": BOOLEAN,
     "kv_cache": BOOLEAN,
+    "critic_steps": Number(low=0, whole=True),
+    "gamma": PROBABILITY_BELOW_1,
+    "expectile": Number(low=0.5, high=1, below_high=True),
 }
 # What the algorithm gives to the policy by itself; everything else is for `policy_kwargs`.
 FROM_ALGORITHM = ("context_length", "max_timestep", "weight_decay", "ema", "seed")
@@ -95,6 +112,14 @@ class SequencePolicy(BasePolicy):
     :param film_return_to_go: let the return-to-go scale and shift what each block of the trunk gets, besides being a token
     :param calm_units: scale observations by what calm episodes spread, for data in which some agents' spread far wider; see
         :meth:`EpisodeTable.statistics`
+    :param critic_steps: with each gradient step, how many a critic takes, which learns what actions are worth so that the
+        best of several can be taken, see :class:`~sb3_dtfm.policies.critic.Critic`; trunk and head learn as without. It
+        needs a head that draws; 0 for no critic
+    :param gamma: discount of a step for the critic
+    :param expectile: of the critic
+    :param n_candidates: actions, or chunks, that are drawn each time, of which the critic has one taken; 1 asks no critic
+    :param temperature: how much chance that choice leaves, in units of how far actions' values spread in the data; 0, the
+        default, takes the most valuable one
     :param ema: keep an exponential moving average of the weights and act with it
     :param kv_cache: act on the keys and values kept of earlier steps instead of recomputing the window: two to three times
         faster, and equal until the window slides (see :meth:`SequenceTrunk.extend`)
@@ -128,6 +153,11 @@ class SequencePolicy(BasePolicy):
         average_return_to_go: bool = False,
         film_return_to_go: bool = False,
         calm_units: bool = False,
+        critic_steps: int = 0,
+        gamma: float = 0.99,
+        expectile: float = 0.7,
+        n_candidates: int = 1,
+        temperature: float = 0.0,
         ema: bool = False,
         kv_cache: bool = False,
         seed: int | None = None,
@@ -150,6 +180,7 @@ class SequencePolicy(BasePolicy):
             )
         arguments.update(check_arguments(arguments, self._acting_rules()))
         self.n_action_steps = arguments["n_action_steps"]
+        self.n_candidates, self.temperature = arguments["n_candidates"], arguments["temperature"]
         self._constructor_arguments = {**arguments, **self.head_class.options(), **head_options}
         self.seed = seed
         self.observation_dim = int(observation_space["observation"].shape[0])  # type: ignore[index]
@@ -164,6 +195,18 @@ class SequencePolicy(BasePolicy):
         self.optimizer = self._make_optimizer(lr_schedule(1.0))
         generator = th.Generator().manual_seed(0 if seed is None else seed)
         self.register_buffer("noise_table", self.network.head.deterministic_noise(generator))
+        self.gamma, self.critic_steps = gamma, arguments["critic_steps"]
+        self.n_valued = self.n_action_steps  # actions that the critic values together: those that are carried out
+        self.critic: Critic | None = None
+        if self.critic_steps:  # made last: the weights of all else are what they are without
+            if self.network.head.noise_dim == 0:
+                raise ValueError(
+                    f"critic_steps={critic_steps}: the critic has nothing to choose among: {self.head_class.algorithm} "
+                    "makes one action of what it sees, where DTFM draws."
+                )
+            self.critic = Critic(self.observation_dim, self.n_valued * self.action_dim, expectile=expectile)
+        self._check_candidates(self.n_candidates)
+        self.steering: Steering | None = None
         self._acting_generator: th.Generator | None = None
         self._remembered = RememberedContext()
 
@@ -325,16 +368,9 @@ class SequencePolicy(BasePolicy):
         arrays, vectorized = unpack_observation(observation, self.observation_dim)
         n_rows, timestep = len(arrays[0]), arrays[2]
         remembers = state is None and episode_start is None
-        nothing = self._empty_context(n_rows)
-        before = check_context(state, nothing) if state is not None else None
         if episode_start is not None:
             episode_start = _check_episode_start(episode_start, n_rows)
-        if remembers:
-            before = self._remembered.recall(arrays[0], timestep)
-        if before is None:
-            before = nothing
-        if before.plan.shape != nothing.plan.shape:  # another number of steps was planned then
-            before = before._replace(plan=nothing.plan, n_planned=nothing.n_planned)
+        before = self._known(self._remembered.recall(arrays[0], timestep) if remembers else state, n_rows)
         lost = restarts(before, timestep) & (timestep > 0)
         if episode_start is not None:
             lost &= ~episode_start
@@ -346,6 +382,99 @@ class SequencePolicy(BasePolicy):
             self._remembered.remember(before, context)
         action = self._to_environment(context.actions[:, -1])
         return action if vectorized else action.squeeze(axis=0), tuple(context)
+
+    def _known(self, state: tuple[np.ndarray, ...] | None, n_rows: int) -> Context:
+        """The context to go on from; a plan for another number of steps than are planned now is dropped."""
+        nothing = self._empty_context(n_rows)
+        if state is None:
+            return nothing
+        before = check_context(state, nothing)
+        if before.plan.shape != nothing.plan.shape:
+            before = before._replace(plan=nothing.plan, n_planned=nothing.n_planned)
+        return before
+
+    def look(
+        self,
+        observation: dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+    ) -> tuple[Context, th.Tensor]:
+        """
+        The first half of acting, for a caller who chooses the noise: :meth:`act_from_noise` is the second one.
+
+        A pure function, as `predict` with a `state`.
+
+        :param observation: as for :meth:`predict`
+        :param state: what :meth:`act_from_noise` or :meth:`predict` returned; None for no past
+        :param episode_start: (B,) bool, True where an environment was just reset
+        :return: the context with the newest step, and the trunk's hidden states (B, D)
+        :raises ValueError: as :meth:`predict`
+        """
+        arrays, _ = unpack_observation(observation, self.observation_dim)
+        n_rows = len(arrays[0])
+        if episode_start is not None:
+            episode_start = _check_episode_start(episode_start, n_rows)
+        context = push(self._known(state, n_rows), *arrays, episode_start=episode_start)
+        self._stop_training()
+        with th.inference_mode():
+            hidden, keys_values = self._hidden(context, np.ones(n_rows, bool))
+        assert hidden is not None
+        return context._replace(keys_values=keys_values), hidden
+
+    def act_from_noise(self, context: Context, hidden: th.Tensor, noise: np.ndarray) -> tuple[np.ndarray, Context]:
+        """
+        The second half: what this noise leads to. Whatever was planned before is dropped.
+
+        :param context: what :meth:`look` returned, with `hidden`
+        :param hidden: (B, D)
+        :param noise: (B, N), for the head's `noise_dim`
+        :return: actions of this step and of those planned, (B, n_action_steps, A) in the environment's range, and the next
+            `state`; until it is `look`'s turn again, `predict` gives the planned ones
+        :raises ValueError: noise that leads to no finite action
+        """
+        with th.inference_mode():
+            chunks = self._to_chunks(self._decode(hidden, th.as_tensor(noise, dtype=th.float32, device=hidden.device)))
+        context = self._carry_out(context, np.ones(len(noise), bool), chunks)
+        planned = np.concatenate([context.actions[:, -1:], context.plan], axis=1)
+        return self._to_environment(planned), context
+
+    def steering_observation(
+        self, windows: Windows, hidden: th.Tensor | None, rows: np.ndarray | slice = slice(None)
+    ) -> th.Tensor:
+        """
+        What noise is chosen by, see :func:`~sb3_dtfm.policies.steering.steering_observation`.
+
+        :param windows: arrays (B, K, ...) in the environment's units; the newest step is read
+        :param hidden: (b, D), None to leave it out
+        :param rows: b of the B rows; all by default
+        :return: (b, F)
+        """
+        newest = Windows(*(th.from_numpy(each[rows, -1:]).to(self.device) for each in windows))
+        return steering_observation(self.normalization, newest, hidden)
+
+    def check_steerable(self) -> int:
+        """
+        :return: N, numbers of the noise that somebody else may choose
+        :raises ValueError: there is no flow
+        """
+        head = self.network.head
+        if not head.noise_dim or not isinstance(self.action_space, spaces.Box):
+            name = type(self).__name__.removesuffix("Policy")
+            raise ValueError(f"{name} of {self.action_space} has no flow whose noise could be chosen; a DTFM is needed.")
+        return head.noise_dim
+
+    def set_steering(self, settings: dict[str, Any] | None) -> None:
+        """
+        Let a network choose the noise from now on; its weights are for the caller to load.
+
+        :param settings: of :class:`~sb3_dtfm.policies.steering.Steering`; None draws noise again
+        :raises ValueError: the head starts from no noise, or a setting out of range
+        """
+        if settings is None:
+            self.steering = None
+            return
+        steering = make_steering(self.observation_dim, self.network.trunk.embed_dim, self.check_steerable(), settings)
+        self.steering = steering.to(self.device).requires_grad_(False)
 
     def reset(self) -> None:
         """Forget the context that `predict` remembers for a caller who passes no `state`."""
@@ -367,14 +496,27 @@ class SequencePolicy(BasePolicy):
 
         :raises ValueError: they would not be finite
         """
-        if self.training:
-            self.set_training_mode(False)  # goes through all modules
+        self._stop_training()
         due = context.n_planned == 0
         with th.inference_mode():
             chunks, keys_values = self._choose(context, due, deterministic)
+        return self._carry_out(context, due, chunks)._replace(keys_values=keys_values)
+
+    def _stop_training(self) -> None:
+        if self.training:
+            self.set_training_mode(False)  # goes through all modules
+
+    def _carry_out(self, context: Context, due: np.ndarray, chunks: np.ndarray) -> Context:
+        """
+        The newest step's actions, and plans for the next ones.
+
+        :param due: (B,) bool, b rows that have new actions
+        :param chunks: (b, H, A) in [-1, 1]
+        :raises ValueError: they are not finite
+        """
         if not (fits := np.isfinite(chunks)).all():
             self._refuse(context, np.flatnonzero(due)[~fits.all(axis=(1, 2))])
-        return with_plan(context, due, chunks[:, : self.n_action_steps])._replace(keys_values=keys_values)
+        return with_plan(context, due, chunks[:, : self.n_action_steps])
 
     @staticmethod
     def _refuse(context: Context, rows: np.ndarray) -> NoReturn:
@@ -398,24 +540,79 @@ class SequencePolicy(BasePolicy):
         :param due: (B,) bool, rows that need new actions, b of them
         :return: (b, H, A) in [-1, 1], and the keys and values to keep, which grow with each step, due or not
         """
+        hidden, keys_values = self._hidden(context, due)
+        if hidden is None:
+            return np.zeros((0, self.chunk_size, self.action_dim), np.float32), keys_values
+        rows = context.timesteps[due, -1] + context.episode_keys[due]
+        if self.n_candidates > 1 and self.steering is None:
+            observations = th.from_numpy(context.observations[due, -1]).to(hidden.device)
+            candidates, chosen = self._draw_candidates(hidden, observations, rows, deterministic)
+            return self._to_chunks(candidates[th.arange(len(chosen), device=hidden.device), chosen]), keys_values
+        noise = self._acting_noise(rows, deterministic).to(hidden.device)
+        if self.steering is not None:
+            shown = self.steering_observation(context.windows, hidden if self.steering.hidden_state else None, due)
+            noise = self.steering(shown, noise)
+        return self._to_chunks(self._decode(hidden, noise)), keys_values
+
+    def _hidden(self, context: Context, due: np.ndarray) -> tuple[th.Tensor | None, np.ndarray]:
+        """
+        :param due: (B,) bool, rows that need new actions, b of them
+        :return: hidden states (b, D) of the newest steps, None where none is due; and the keys and values to keep, which
+            grow with each step, due or not
+        """
         caches = self.kv_cache and self.context_length > 1
-        nothing = np.zeros((0, self.chunk_size, self.action_dim), np.float32)
         keys_values = np.zeros((len(due), 0), np.float32)
         if not caches and not due.any():
-            return nothing, keys_values
+            return None, keys_values
         device = self.device  # SB3 looks for it among the parameters each time
-        network = self.acting_network
         windows = Windows(*(th.from_numpy(each if caches else each[due]).to(device) for each in context.windows))
-        if caches:
-            hidden, keys_values = self._extend(self.normalization(windows), context.keys_values)
-            if not due.any():
-                return nothing, keys_values
-            hidden = hidden[th.from_numpy(due).to(device)]
-        else:
-            hidden = self.hidden_states(network, windows, last_only=True).squeeze(1)
-        noise = self._acting_noise(context.timesteps[due, -1] + context.episode_keys[due], deterministic).to(device)
-        actions = network.head(hidden, noise).clamp(-1.0, 1.0)
-        return actions.cpu().numpy().reshape(-1, self.chunk_size, self.action_dim), keys_values
+        if not caches:
+            return self.hidden_states(self.acting_network, windows, last_only=True).squeeze(1), keys_values
+        hidden, keys_values = self._extend(self.normalization(windows), context.keys_values)
+        return (hidden[th.from_numpy(due).to(device)] if due.any() else None), keys_values
+
+    def _decode(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        """From hidden states (b, D) and noise (b, N) to chunks (b, H A) in [-1, 1]."""
+        return self.acting_network.head(hidden, noise).clamp(-1.0, 1.0)
+
+    def _to_chunks(self, actions: th.Tensor) -> np.ndarray:
+        """From (b, H A) to (b, H, A) on the CPU."""
+        return actions.cpu().numpy().reshape(-1, self.chunk_size, self.action_dim)
+
+    def _draw_candidates(
+        self, hidden: th.Tensor, observations: th.Tensor, rows: np.ndarray, deterministic: bool
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """
+        Several draws from the head, and which of them the critic has taken.
+
+        :param hidden: (b, D)
+        :param observations: (b, O) as the environment gives them
+        :param rows: (b,) of the noise table; the first candidate's are these
+        :return: (b, N, H A) in [-1, 1], and (b,) int64
+        """
+        assert self.critic is not None
+        n, turns = self.n_candidates, np.arange(self.n_candidates)
+        noise = self._acting_noise((rows[:, None] + CANDIDATE_STRIDE * turns).ravel(), deterministic).to(hidden.device)
+        candidates = self._decode(hidden.repeat_interleave(n, dim=0), noise).view(len(hidden), n, -1)
+        chance = self._acting_noise((rows[:, None] + CHOICE_START + CHOICE_STRIDE * turns).ravel(), deterministic)
+        uniform = th.special.ndtr(chance[:, 0]).clamp(1e-6, 1 - 1e-6).view(len(hidden), n).to(hidden.device)
+        states = self.normalization.scale_observation(observations).unsqueeze(1).expand(-1, n, -1)
+        values = self.critic(states, candidates[..., : self.n_valued * self.action_dim])
+        return candidates, self.critic.choose(values, self.temperature, uniform)
+
+    def guided_share(self, batch: Windows, generator: th.Generator) -> th.Tensor:
+        """
+        How often the critic has another candidate taken than the first one, at the newest steps of windows.
+
+        :param batch: windows of a buffer
+        :param generator: decides which rows of the noise table
+        """
+        self.set_training_mode(False)
+        with th.no_grad():
+            hidden = self.hidden_states(self.acting_network, self.scaled_windows(batch), last_only=True).squeeze(1)
+            rows = th.randint(NOISE_ROWS, (len(hidden),), generator=generator, device=generator.device).cpu().numpy()
+            _, chosen = self._draw_candidates(hidden, batch.observations[:, -1], rows, deterministic=True)
+            return (chosen != 0).float().mean()
 
     def _extend(self, windows: Windows, kept: np.ndarray) -> tuple[th.Tensor, np.ndarray]:
         """
@@ -483,7 +680,18 @@ class SequencePolicy(BasePolicy):
 
     def _acting_rules(self) -> dict[str, Rule]:
         """The policy's own ways of acting; the others are the head's."""
-        return {"kv_cache": BOOLEAN, "n_action_steps": Number(low=1, high=self.chunk_size, whole=True)}
+        return {
+            "kv_cache": BOOLEAN,
+            "n_action_steps": Number(low=1, high=self.chunk_size, whole=True),
+            "n_candidates": Number(low=1, high=NOISE_ROWS, whole=True),
+            "temperature": NOT_NEGATIVE,
+        }
+
+    def _check_candidates(self, n_candidates: int) -> None:
+        if n_candidates > 1 and self.critic is None:
+            raise ValueError(
+                f"n_candidates={n_candidates} needs a model that was trained with policy_kwargs=dict(critic_steps=...)."
+            )
 
     def set_acting(self, **settings: Any) -> None:
         """
@@ -498,6 +706,7 @@ class SequencePolicy(BasePolicy):
             raise ValueError(f"{with_nearest(unknown, accepted)}: no way of acting; accepted are {', '.join(accepted)}.")
         settings = {**self.acting_settings(), **settings}
         own = check_arguments(settings, self._acting_rules())
+        self._check_candidates(own["n_candidates"])
         heads = self.network.head.check_acting(**{name: settings[name] for name in self.network.head.acting_choices})
         for name, value in own.items():
             setattr(self, name, value)

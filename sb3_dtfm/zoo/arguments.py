@@ -12,7 +12,7 @@ from rl_zoo3.utils import StoreDict
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.envs import register_gymnasium_robotics
-from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, packaged_config
+from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, STEERED, packaged_config
 
 TRAIN_EXAMPLES = """\
   sb3-dtfm train --algo dtfm --env HalfCheetah-v5
@@ -166,7 +166,7 @@ def _shorthands(options: argparse.Namespace, given: dict[str, Any]) -> list[tupl
 
 def enjoy_arguments(argv: Sequence[str]) -> list[str]:
     """
-    Arguments for RL-Zoo's `enjoy`: dt and dtfm are looked for where `train` puts them, not among the Zoo's own agents.
+    Arguments for RL-Zoo's `enjoy`: ours are looked for where `train` puts them, not among the Zoo's own agents.
 
     :param argv: the user's arguments
     """
@@ -174,6 +174,6 @@ def enjoy_arguments(argv: Sequence[str]) -> list[str]:
     parser.add_argument("--algo")
     parser.add_argument("-f", "--folder")
     options, _ = parser.parse_known_args(argv)
-    if options.algo in ALGORITHMS and options.folder is None:
+    if options.algo in (*ALGORITHMS, STEERED) and options.folder is None:
         return [*argv, "--folder", "logs"]
     return list(argv)

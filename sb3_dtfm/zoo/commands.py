@@ -14,6 +14,7 @@ import rl_zoo3.utils
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3.utils import get_model_path
 
+from sb3_dtfm.zoo.finetuning import FinetuningManager
 from sb3_dtfm.zoo.manager import OfflineExperimentManager
 
 
@@ -43,6 +44,20 @@ def train(arguments: Sequence[str], resumed: Path | None = None) -> None:
     manager = functools.partial(OfflineExperimentManager, arguments=list(arguments), resumed=resumed)
     rl_zoo3.train.ExperimentManager = manager  # type: ignore[misc,assignment]
     _call(rl_zoo3.train.train, "train", arguments)
+
+
+def finetune(arguments: Sequence[str], model: Path, target_return: float | None = None) -> None:
+    """
+    Have an online algorithm steer a frozen DTFM, through :class:`FinetuningManager`.
+
+    :param arguments: of RL-Zoo's `train`
+    :param model: zip file of the DTFM, or folder of its run
+    :param target_return: to ask for; None as in that run
+    :raises TrainingError: training failed in its midst
+    """
+    manager = functools.partial(FinetuningManager, base=model, target_return=target_return)
+    rl_zoo3.train.ExperimentManager = manager  # type: ignore[misc,assignment]
+    _call(rl_zoo3.train.train, "finetune", arguments)
 
 
 def enjoy(arguments: Sequence[str]) -> None:

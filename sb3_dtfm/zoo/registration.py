@@ -11,8 +11,13 @@ from rl_zoo3.utils import ALGOS
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.envs import register_gymnasium_robotics
+from sb3_dtfm.finetuning import SteeredDTFM
 from sb3_dtfm.policies import SequencePolicy
 
+# What RL-Zoo calls a DTFM that an online algorithm steers: a folder of the logs, and `enjoy --algo`.
+STEERED = "steered"
+# Where settings of the online algorithms are.
+FINETUNING_CONFIGS = "sb3_dtfm.zoo_configs.finetune"
 # What `--conf-file` accepts besides files and Python packages; None is no `--conf-file` at all.
 PACKAGED_CONFIGS = {None: "sb3_dtfm.zoo_configs", "small": "sb3_dtfm.zoo_configs.small"}
 
@@ -24,7 +29,7 @@ def register() -> None:
     So do tasks of gymnasium-robotics, which RL-Zoo does not know.
     """
     register_gymnasium_robotics()
-    ALGOS.update(ALGORITHMS)
+    ALGOS.update({**ALGORITHMS, STEERED: SteeredDTFM})
     HYPERPARAMS_SAMPLER.update({name: partial(sample_params, name) for name in ALGORITHMS})
     HYPERPARAMS_CONVERTER.update({name: partial(convert_params, name) for name in ALGORITHMS})
 
@@ -39,6 +44,20 @@ def packaged_config(algo: str, name: str | None = None) -> Path:
     folder = resources.files(PACKAGED_CONFIGS[name])
     own = Path(str(folder.joinpath(f"{algo}.yml")))
     return own if own.is_file() else Path(str(folder.joinpath("dt.yml")))
+
+
+def finetuning_config(algo: str) -> Path:
+    """
+    Hyperparameter file that comes with the package, of an algorithm that steers.
+
+    :param algo: RL-Zoo's name
+    :raises ValueError: there is none
+    """
+    folder = Path(str(resources.files(FINETUNING_CONFIGS)))
+    found = {path.stem: path for path in sorted(folder.glob("*.yml"))}
+    if algo not in found:
+        raise ValueError(f"--algo {algo}: no packaged settings; those of {', '.join(found)} are. Others need a --conf-file.")
+    return found[algo]
 
 
 def policy_of(algo: str) -> type[SequencePolicy]:

@@ -16,6 +16,7 @@ ALGORITHMS = [(DT, TINY_POLICY), (DTFM, TINY_FLOW_POLICY)]
 ONE_TOKEN_OPTIONS = {"tokens_per_step": 1, "film_return_to_go": True, "average_return_to_go": True}
 ONE_TOKEN = [(algorithm, {**policy_kwargs, **ONE_TOKEN_OPTIONS}) for algorithm, policy_kwargs in ALGORITHMS]
 CHUNKS = [(algorithm, {**policy_kwargs, "chunk_size": 4, "n_action_steps": 3}) for algorithm, policy_kwargs in ONE_TOKEN]
+UNGUIDED = {"n_candidates": 1, "temperature": 0.0}
 IDS = [f"{algorithm}{variant}" for variant in ("", ", one token", ", chunks") for algorithm in ("dt", "dtfm")]
 
 
@@ -308,7 +309,7 @@ def test_one_step_acting_is_one_evaluation_saved_with_the_model(cheetah_buffer, 
     model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=policy_kwargs, batch_size=16, seed=0).learn(5)
     model.save(tmp_path / "model.zip")
     loaded = DTFM.load(tmp_path / "model.zip")
-    settings = {"solver": "one_step", "n_solver_steps": 4, "kv_cache": True, "n_action_steps": 1}
+    settings = {"solver": "one_step", "n_solver_steps": 4, "kv_cache": True, "n_action_steps": 1, **UNGUIDED}
     assert loaded.policy.acting_settings() == settings
     assert np.array_equal(roll_plain(model, 8), roll_plain(loaded, 8))
     model.policy.set_solver("euler", 10)
@@ -321,7 +322,7 @@ def test_a_way_of_acting_that_was_chosen_after_training_is_saved(cheetah_buffer,
     model.policy.set_acting(kv_cache=True)
     model.save(tmp_path / "model.zip")
     loaded = DTFM.load(tmp_path / "model.zip")
-    settings = {"solver": "heun", "n_solver_steps": 3, "kv_cache": True, "n_action_steps": 1}
+    settings = {"solver": "heun", "n_solver_steps": 3, "kv_cache": True, "n_action_steps": 1, **UNGUIDED}
     assert loaded.policy.acting_settings() == settings
     assert np.array_equal(roll_plain(model, 8), roll_plain(loaded, 8))
 

@@ -1,0 +1,128 @@
+"""A DTFM and the steering that was learned for it, as one model."""
+
+import io
+from typing import Any, NoReturn
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from torch import nn
+
+from sb3_dtfm.algorithms import DTFM
+from sb3_dtfm.finetuning.noise_env import NoiseActionVecEnv
+from sb3_dtfm.policies import SequencePolicy
+from sb3_dtfm.policies.steering import ACTIVATIONS
+
+# Classes whose actors can be taken over, by whether they squash their actions by tanh; sb3-contrib is an extra.
+SQUASHED = {"SAC": True, "TQC": True, "PPO": False, "A2C": False, "TRPO": False}
+
+
+class SteeredDTFM(DTFM):
+    """
+    A DTFM whose noise an online algorithm has learned to choose. It acts, is saved, loaded and exported as a DTFM is.
+
+    `deterministic=True` takes what the algorithm's actor makes of the rows of the model's noise table, which is one draw of
+    the actor's distribution that repeats exactly: at first this is what DTFM itself does, and it stays what the algorithm
+    learns from. The actor's mean would begin at zero noise, where arms get stuck.
+
+    Without a steering it is the DTFM. It does not learn from data; another steering is learned by
+    `SAC("MlpPolicy", NoiseActionVecEnv(venv, model))`.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.steering: dict[str, Any] | None = None
+        super().__init__(*args, **kwargs)
+
+    def _make_policy(self, ema: bool) -> SequencePolicy:
+        policy = super()._make_policy(ema)
+        policy.set_steering(self.steering)
+        return policy
+
+    @classmethod
+    def of(cls, model: DTFM, agent: BaseAlgorithm | None = None) -> "SteeredDTFM":
+        """
+        A copy of a model, that an agent steers.
+
+        :param model: stays as it is
+        :param agent: see :meth:`steer`; None for no steering
+        :raises ValueError: an actor that cannot be taken over
+        """
+        file = io.BytesIO()
+        model.save(file)
+        steered = cls.load(file, device=model.device)
+        steered.policy.optimizer.state.clear()  # it learns no more: half of the file
+        if agent is not None:
+            steered.steer(agent)
+        return steered
+
+    def steer(self, agent: BaseAlgorithm) -> None:
+        """
+        Act by an agent's actor as it is now.
+
+        :param agent: SAC, TQC, PPO, A2C or TRPO, whose "MlpPolicy" learns in a :class:`NoiseActionVecEnv`
+        :raises ValueError: another kind of actor
+        """
+        settings, weights = _take_over(agent)
+        if settings != self.steering or self.policy.steering is None:
+            self.policy.set_steering(settings)
+            self.steering = settings
+        assert self.policy.steering is not None
+        self.policy.steering.load_state_dict(weights)
+
+    def learn(self, *args: Any, **kwargs: Any) -> NoReturn:
+        """:raises ValueError: always"""
+        raise ValueError(
+            "A steered model does not learn from data: it would no longer be what its steering was learned for."
+        )
+
+
+def _take_over(agent: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
+    """
+    An actor as settings and weights of :class:`~sb3_dtfm.policies.steering.Steering`.
+
+    :raises ValueError: one that has another form
+    """
+    name = next((each.__name__ for each in type(agent).__mro__ if each.__name__ in SQUASHED), None)
+    if name is None:
+        _refuse(agent, f"it is a {type(agent).__name__}")
+    env = agent.get_env()
+    while env is not None and not isinstance(env, NoiseActionVecEnv):
+        if getattr(env, "norm_obs", False):
+            _refuse(agent, "VecNormalize stands between its actor and the noise's environment, which is normalised already")
+        env = getattr(env, "venv", None)
+    if env is None:
+        _refuse(agent, "it does not learn in a NoiseActionVecEnv")
+    policy: Any = agent.policy
+    if getattr(agent, "use_sde", False):
+        _refuse(agent, "its exploration depends on the state (use_sde)")
+    latent, mean, log_std = (
+        (policy.actor.latent_pi, policy.actor.mu, policy.actor.log_std)
+        if SQUASHED[name]
+        else (policy.mlp_extractor.policy_net, policy.action_net, policy.log_std)
+    )
+    if not SQUASHED[name] and policy.squash_output:
+        _refuse(agent, "squash_output=True")
+    linear, activations = latent[::2], {type(each).__name__ for each in latent[1::2]} or {"ReLU"}
+    plain = isinstance(agent.observation_space, spaces.Box) and all(isinstance(each, nn.Linear) for each in linear)
+    if not plain or len(activations) != 1 or not activations <= set(ACTIVATIONS):
+        _refuse(agent, f"its actor is {latent}, expected linear layers with one of {', '.join(ACTIVATIONS)} between them")
+    settings = {
+        "layers": [each.out_features for each in linear],
+        "activation": activations.pop(),
+        "squashed": SQUASHED[name],
+        "bound": env.bound,
+        "hidden_state": env.hidden_state,
+    }
+    weights = {f"layers.{i}.0.{key}": value for i, each in enumerate(linear) for key, value in each.state_dict().items()}
+    weights |= {f"mean.{key}": value for key, value in mean.state_dict().items()}
+    if isinstance(log_std, nn.Linear):
+        weights |= {f"log_std.{key}": value for key, value in log_std.state_dict().items()}
+    else:  # the same for all observations
+        weights |= {"log_std.weight": th.zeros_like(mean.weight), "log_std.bias": log_std.detach()}
+    return settings, weights
+
+
+def _refuse(agent: BaseAlgorithm, why: str) -> NoReturn:
+    raise ValueError(
+        f'The actor of {type(agent).__name__} cannot be taken over: {why}. The "MlpPolicy" of {", ".join(SQUASHED)} can.'
+    )

@@ -1,0 +1,127 @@
+"""
+What actions are worth, learned from recorded data alone (IQL), so that the best of several drawn actions can be taken.
+
+Values are per unit of reward that :meth:`Critic.set_scale` chose; gradient steps are the algorithm's.
+"""
+
+import copy
+
+import torch as th
+from torch import nn
+
+from sb3_dtfm.windows import Transitions
+
+# Kostrikov et al. (2022): how fast the network that backups look at follows, and the rate at which all learn.
+TARGET_SHARE = 0.005
+LEARNING_RATE = 3e-4
+BATCH_SIZE = 256
+# What the largest discounted return-to-go becomes.
+LARGEST_VALUE = 10.0
+# How fast the spread of advantages follows the batches.
+SPREAD_SHARE = 0.01
+
+
+class Critic(nn.Module):
+    """
+    Implicit Q-learning (Kostrikov et al., 2022): values of observations and actions, without asking about an action that
+    nobody took.
+
+    V(s) is an expectile of Q(s, a) over the data's actions, above their mean: what a good one of them leads to. Q(s, a) is
+    the reward and the discounted V of the next observation. Of two Qs the smaller one counts.
+
+    :param observation_dim: O
+    :param action_dim: h A, of all actions that are valued together
+    :param hidden_dim: width of two hidden layers
+    :param expectile: in (0.5, 1): 0.5 values the data's policy, near 1 the best of its actions, and luck with them
+    """
+
+    batch_size = BATCH_SIZE
+    reward_scale: th.Tensor
+    spread: th.Tensor
+
+    def __init__(self, observation_dim: int, action_dim: int, hidden_dim: int = 256, expectile: float = 0.7) -> None:
+        super().__init__()
+        self.expectile = expectile
+        self.q = nn.ModuleList(_mlp(observation_dim + action_dim, hidden_dim) for _ in range(2))
+        self.q_target = copy.deepcopy(self.q).requires_grad_(False)
+        self.value = _mlp(observation_dim, hidden_dim)
+        self.register_buffer("reward_scale", th.ones(()))
+        self.register_buffer("spread", th.ones(()))
+        trained = [*self.q.parameters(), *self.value.parameters()]
+        self.optimizer: th.optim.Optimizer = th.optim.Adam(trained, lr=LEARNING_RATE, fused=True)
+
+    def set_scale(self, largest_return: float) -> None:
+        """
+        :param largest_return: largest absolute discounted return-to-go of the data, environment reward units
+        """
+        self.reward_scale.fill_(LARGEST_VALUE / largest_return if largest_return > 0 else 1.0)
+
+    def forward(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        The smaller of the two values of the network that follows.
+
+        :param observations: (..., O), normalised
+        :param actions: (..., h A) in [-1, 1]
+        :return: (...)
+        """
+        pairs = th.cat((observations, actions), dim=-1)
+        return th.minimum(*(q(pairs).squeeze(-1) for q in self.q_target))
+
+    def loss(self, batch: Transitions) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        """
+        :param batch: observations normalised, actions in [-1, 1]
+        :return: the loss to minimise, and what is logged
+        """
+        pairs = th.cat((batch.observations, batch.actions), dim=-1)
+        with th.no_grad():
+            future = self.value(batch.next_observations).squeeze(-1)
+            backup = self.reward_scale * batch.rewards + batch.discounts * future
+            valued = th.minimum(*(q(pairs).squeeze(-1) for q in self.q_target))
+        advantage = valued - self.value(batch.observations).squeeze(-1)
+        weight = th.where(advantage > 0, self.expectile, 1.0 - self.expectile)
+        value_loss = _mean(weight * advantage.square(), batch.mask)
+        errors = [(q(pairs).squeeze(-1) - backup).square() for q in self.q]
+        critic_loss = _mean(errors[0] + errors[1], batch.mask)
+        self.spread.lerp_(_mean(advantage.detach().square(), batch.mask).sqrt(), SPREAD_SHARE)
+        parts = {"critic_loss": critic_loss, "value_loss": value_loss, "q_value": _mean(valued, batch.mask)}
+        return critic_loss + value_loss, parts
+
+    def learn(self, batch: Transitions) -> dict[str, th.Tensor]:
+        """
+        A gradient step; one whose loss is not finite changes nothing.
+
+        :param batch: observations normalised, actions in [-1, 1]
+        :return: what is logged
+        """
+        loss, parts = self.loss(batch)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimizer.found_inf = (~th.isfinite(loss)).float().detach()  # type: ignore[attr-defined]
+        self.optimizer.step()
+        # What backups look at moves towards what learns.
+        followers = [parameter.data for parameter in self.q_target.parameters()]
+        th._foreach_lerp_(followers, [parameter.data for parameter in self.q.parameters()], TARGET_SHARE)
+        return parts
+
+    def choose(self, values: th.Tensor, temperature: float, uniform: th.Tensor) -> th.Tensor:
+        """
+        One of N actions, with probabilities softmax(Q / (temperature * spread of advantages)) (Hansen-Estruch et al., 2023).
+
+        :param values: (B, N)
+        :param temperature: 0 takes the largest
+        :param uniform: (B, N) in (0, 1), what chance decides by (Gumbel's trick)
+        :return: (B,) int64
+        """
+        chance = -(-uniform.log()).log()
+        return (values + temperature * self.spread * chance).argmax(dim=-1)
+
+
+def _mlp(input_dim: int, hidden_dim: int) -> nn.Sequential:
+    """Layer norms keep the values of actions that nobody took near those of others (Ball et al., 2023)."""
+    sizes = (input_dim, hidden_dim, hidden_dim)
+    hidden = [layer for i in (0, 1) for layer in (nn.Linear(sizes[i], sizes[i + 1]), nn.LayerNorm(sizes[i + 1]), nn.ReLU())]
+    return nn.Sequential(*hidden, nn.Linear(hidden_dim, 1))
+
+
+def _mean(values: th.Tensor, mask: th.Tensor) -> th.Tensor:
+    return (values * mask).sum() / mask.sum().clamp(min=1)

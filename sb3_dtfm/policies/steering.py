@@ -1,0 +1,109 @@
+"""Steering: noise that an online algorithm has learned to choose, in place of drawn noise (Wagenmaker et al., 2025)."""
+
+from typing import Any
+
+import torch as th
+from torch import nn
+
+from sb3_dtfm.arguments import BOOLEAN, COUNT, POSITIVE, Choice, Rule, check_arguments
+from sb3_dtfm.policies.normalization import OBSERVATION_CLIP, Normalization
+from sb3_dtfm.windows import Windows
+
+ACTIVATIONS: dict[str, type[nn.Module]] = {
+    each.__name__: each for each in (nn.ReLU, nn.Tanh, nn.ELU, nn.GELU, nn.LeakyReLU, nn.SiLU)
+}
+# Logarithms of standard deviations, as Stable-Baselines3's SAC limits them.
+LOG_STD_RANGE = (-20.0, 2.0)
+MAX_LAYERS = 32
+ACCEPTED: dict[str, Rule] = {
+    "activation": Choice(tuple(ACTIVATIONS)),
+    "squashed": BOOLEAN,
+    "bound": POSITIVE,
+    "hidden_state": BOOLEAN,
+}
+
+
+def steering_observation(normalization: Normalization, newest: Windows, hidden: th.Tensor | None) -> th.Tensor:
+    """
+    What noise is chosen by: all that the frozen policy's newest step depends on, but for the steps before it.
+
+    Observations are in standard deviations of the training data, without what `calm_units` puts on top: the units that an
+    ordinary network learns from, as behind SB3's `VecNormalize`.
+
+    :param normalization: of the policy
+    :param newest: (B, 1, ...), in the environment's units
+    :param hidden: (B, D) of the trunk; None leaves it out
+    :return: (B, O + 2), or (B, O + 2 + D), each within `OBSERVATION_CLIP`: observation, return-to-go as the trunk gets it,
+        time step as a share of the longest episode that was learned from
+    """
+    scaled = normalization(newest)
+    parts = [
+        scaled.observations[:, 0] / normalization.observation_gain,
+        scaled.returns_to_go,
+        newest.timesteps / float(normalization.max_timestep),
+    ]
+    return th.cat(parts if hidden is None else [*parts, hidden], dim=1).clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP)
+
+
+class Steering(nn.Module):
+    """
+    A Gaussian actor over noise, in a form that holds those of several algorithms.
+
+    :param observation_dim: F, numbers of :func:`steering_observation`
+    :param noise_dim: N
+    :param layers: widths of the hidden layers
+    :param activation: a key of `ACTIVATIONS`
+    :param squashed: noise is bound * tanh(...), as SAC's and TQC's actions; otherwise clipped to the bound, as PPO's
+    :param bound: largest absolute noise
+    :param hidden_state: the trunk's hidden state is part of what it sees
+    :raises ValueError: an argument out of range, by name
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        noise_dim: int,
+        *,
+        layers: list[int],
+        activation: str,
+        squashed: bool,
+        bound: float,
+        hidden_state: bool,
+    ) -> None:
+        super().__init__()
+        check_arguments(locals(), ACCEPTED)
+        if not isinstance(layers, list) or len(layers) > MAX_LAYERS or not all(map(COUNT.accepts, layers)):
+            raise ValueError(f"layers must be at most {MAX_LAYERS} whole numbers of at least 1, got {layers!r}.")
+        self.squashed = squashed
+        self.bound = bound
+        self.hidden_state = hidden_state
+        widths = [observation_dim, *layers]
+        hidden = [nn.Sequential(nn.Linear(*pair), ACTIVATIONS[activation]()) for pair in zip(widths, layers, strict=False)]
+        self.layers = nn.Sequential(*hidden)
+        self.mean = nn.Linear(widths[-1], noise_dim)
+        self.log_std = nn.Linear(widths[-1], noise_dim)
+
+    def forward(self, observation: th.Tensor, drawn: th.Tensor) -> th.Tensor:
+        """
+        :param observation: (B, F)
+        :param drawn: (B, N), standard normal
+        :return: noise (B, N), of the actor's distribution
+        """
+        latent = self.layers(observation)
+        noise = self.mean(latent) + self.log_std(latent).clamp(*LOG_STD_RANGE).exp() * drawn
+        return self.bound * noise.tanh() if self.squashed else noise.clamp(-self.bound, self.bound)
+
+
+def make_steering(observation_dim: int, embed_dim: int, noise_dim: int, settings: dict[str, Any]) -> Steering:
+    """
+    :param observation_dim: O, of the environment
+    :param embed_dim: D, of the trunk
+    :param noise_dim: N, of the head
+    :param settings: the keyword arguments of :class:`Steering`
+    :raises ValueError: others than those, or one out of range
+    """
+    try:
+        sees = observation_dim + 2 + (embed_dim if settings.get("hidden_state") else 0)
+        return Steering(sees, noise_dim, **settings)
+    except TypeError as error:
+        raise ValueError(f"No settings of a steering: {error}.") from error

@@ -1,0 +1,206 @@
+"""RL-Zoo's experiment of an online algorithm that steers a frozen DTFM."""
+
+import os
+import shutil
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rl_zoo3.utils import get_latest_run_id, get_saved_hyperparams
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback, EvalCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_dtfm.algorithms import DTFM
+from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
+from sb3_dtfm.finetuning import NoiseActionVecEnv, SteeredDTFM
+from sb3_dtfm.zoo.arguments import UsageError
+from sb3_dtfm.zoo.manager import OfflineExperimentManager
+from sb3_dtfm.zoo.registration import STEERED
+
+# The key of the settings of a NoiseActionVecEnv in a run's config.yml, where `enjoy` must not find a wrapper.
+NOISE_ENV = "noise_env"
+# The online algorithm itself, as Stable-Baselines3 saves it.
+AGENT = "agent"
+
+
+def _environment_of(run: Path) -> dict[str, Any]:
+    """
+    What a run's environment was made with, as `enjoy` finds it.
+
+    :param run: the folder that holds its config.yml and args.yml, or does not exist
+    """
+    known = get_saved_hyperparams(str(run))[0] if (run / "config.yml").is_file() else {}
+    arguments = yaml.load((run / "args.yml").read_text(), Loader=yaml.UnsafeLoader) if (run / "args.yml").is_file() else {}
+    env_kwargs = arguments.get("env_kwargs") or known.get("env_kwargs")
+    return {"env_wrapper": known.get("env_wrapper"), "env_kwargs": env_kwargs}
+
+
+class SteeredCallbacks(BaseCallback):
+    """
+    Have evaluations and checkpoints see the steered model in the place of the algorithm that learns to steer it.
+
+    Until the algorithm has learned, that is the model without a steering: the curve begins at the offline policy's score.
+
+    :param steered: acts by the algorithm's actor whenever it is looked at
+    :param callbacks: to run with it
+    :param seed: of the run, which evaluations are seeded by
+    """
+
+    def __init__(self, steered: SteeredDTFM, callbacks: list[BaseCallback], seed: int) -> None:
+        super().__init__()
+        self.steered = steered
+        self.evaluations = [each for each in callbacks if isinstance(each, EvalCallback)]
+        at_ends = EvaluateAtStartAndEnd(self.evaluations)
+        self.inner = CallbackList([SeedEvaluations(self.evaluations, seed), *callbacks, at_ends])
+
+    def _init_callback(self) -> None:
+        self.steered.set_logger(self.logger)
+        for evaluation in self.evaluations:
+            self.steered.n_envs = evaluation.eval_env.num_envs
+            self.steered.set_env(evaluation.eval_env)
+        self.inner.init_callback(self.steered)
+
+    def _on_training_start(self) -> None:
+        self._take_over()
+        self.inner.on_training_start(self.locals, self.globals)
+
+    def _on_step(self) -> bool:
+        self.steered.num_timesteps = self.num_timesteps
+        environment: Any = self.training_env
+        self.logger.record("time/environment_steps", environment.n_environment_steps)
+        if any((each.n_calls + 1) % freq == 0 for each, freq in self._looking()):
+            self._take_over()
+        return self.inner.on_step()
+
+    def _on_training_end(self) -> None:
+        self._take_over()
+        self.inner.on_training_end()
+
+    def _looking(self) -> list[tuple[BaseCallback, int]]:
+        """Those of the callbacks that look at the model now and then, and how often."""
+        frequencies = (
+            (each, getattr(each, "eval_freq", 0) or getattr(each, "save_freq", 0)) for each in self.inner.callbacks
+        )
+        return [(each, frequency) for each, frequency in frequencies if frequency > 0]
+
+    def _take_over(self) -> None:
+        self.steered.num_timesteps = self.model.num_timesteps
+        if has_learned(self.model):
+            self.steered.steer(self.model)
+
+
+def has_learned(agent: BaseAlgorithm) -> bool:
+    """Whether an algorithm has done a gradient step."""
+    return getattr(agent, "_n_updates", 0) > 0
+
+
+class FinetuningManager(OfflineExperimentManager):
+    """
+    RL-Zoo's own manager, for an online algorithm in a :class:`~sb3_dtfm.finetuning.NoiseActionVecEnv`.
+
+    What it evaluates and saves is the steered model, in the folder of a run of "steered"; beside it the algorithm itself.
+
+    :param base: file of the DTFM, or folder of its run
+    :param target_return: to ask for; by default as in that run
+    """
+
+    def __init__(self, *args: Any, base: Path, target_return: float | None = None, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.base, self.target_return = base, target_return
+        self.base_file = base / f"{self.env_name}.zip" if base.is_dir() else base
+        if not self.base_file.is_file():
+            raise FileNotFoundError(f"{self.base_file} does not exist; --model names a DTFM's zip file or its run's folder.")
+        self.steered = SteeredDTFM.of(DTFM.load(self.base_file, device=self.device))
+        name = Path(self.save_path).name.removeprefix(f"{self.env_name}_")
+        uuid = name.lstrip("0123456789")
+        self.log_path = f"{self.log_folder}/{STEERED}/"
+        number = get_latest_run_id(self.log_path, self.env_name) + 1
+        self.save_path = os.path.join(self.log_path, f"{self.env_name}_{number}{uuid}")
+        self.params_path = f"{self.save_path}/{self.env_name}"
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """RL-Zoo's; what the environment was to the frozen policy comes from its run."""
+        hyperparams, _ = super().read_hyperparameters()
+        known = _environment_of(self.base_file.parent / self.env_name)
+        if self.env_kwargs:  # of the command line
+            del known["env_kwargs"]
+        hyperparams = {**{key: value for key, value in known.items() if value}, **hyperparams}
+        if self._eval_env_kwargs_args is None:
+            self.eval_env_kwargs = hyperparams.get("env_kwargs") or self.env_kwargs
+        if self.target_return is not None:
+            hyperparams["env_wrapper"] = [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": self.target_return}}]
+        if not hyperparams.get("env_wrapper"):
+            raise UsageError(f"--target-return: needed, as {self.base} does not tell what return was asked for.")
+        noise_env = self._noise_env(hyperparams)
+        saved = {key: value for key, value in hyperparams.items() if key != "vec_env_wrapper"}
+        saved[NOISE_ENV] = {**noise_env, "algorithm": self.algo, "model": str(self.base_file)}
+        path = f"{NoiseActionVecEnv.__module__}.{NoiseActionVecEnv.__name__}"
+        hyperparams["vec_env_wrapper"] = [{path: {**noise_env, "model": self.steered}}]
+        return hyperparams, OrderedDict(sorted(saved.items()))
+
+    @staticmethod
+    def _noise_env(hyperparams: dict[str, Any]) -> dict[str, Any]:
+        """
+        The arguments of the settings' NoiseActionVecEnv.
+
+        :raises UsageError: another wrapper of vectorised environments
+        """
+        wrappers = hyperparams.get("vec_env_wrapper") or []
+        wrappers = wrappers if isinstance(wrappers, list) else [wrappers]
+        if not wrappers:
+            return {}
+        name, arguments = next(iter(wrappers[0].items())) if isinstance(wrappers[0], dict) else (wrappers[0], {})
+        if len(wrappers) > 1 or not name.endswith(f".{NoiseActionVecEnv.__name__}"):
+            raise UsageError(f"vec_env_wrapper: {wrappers}; expected sb3_dtfm.finetuning.NoiseActionVecEnv alone.")
+        return dict(arguments or {})
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        """RL-Zoo's; the steered model is evaluated in the environment itself."""
+        wrapper = self.vec_env_wrapper
+        try:
+            if eval_env:
+                self.vec_env_wrapper = None
+            return super().create_envs(n_envs, eval_env, no_log)
+        finally:
+            self.vec_env_wrapper = wrapper
+
+    def create_callbacks(self) -> None:
+        """RL-Zoo's; evaluations and checkpoints are of the steered model."""
+        super().create_callbacks()
+        of_the_model: list[BaseCallback] = [
+            each for each in self.callbacks if isinstance(each, EvalCallback | CheckpointCallback)
+        ]
+        others = [each for each in self.callbacks if each not in of_the_model]
+        self.callbacks = [*others, SteeredCallbacks(self.steered, of_the_model, self.seed)]
+
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        """
+        RL-Zoo's.
+
+        :raises ValueError: an actor that cannot be taken over
+        """
+        result = super().setup_experiment()
+        assert result is not None
+        try:
+            SteeredDTFM.of(self.steered, result[0])
+        except ValueError:
+            shutil.rmtree(self.save_path)
+            raise
+        return result
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        """
+        The steered model where RL-Zoo looks for one, and the algorithm beside it, to go on with.
+
+        :param model: the online algorithm
+        """
+        print(f"Saving to {self.save_path}")
+        if has_learned(model):
+            self.steered.steer(model)
+        self.steered.save(os.path.join(self.save_path, f"{self.env_name}.zip"))
+        model.save(os.path.join(self.save_path, AGENT))
+        if self.save_replay_buffer and isinstance(model, OffPolicyAlgorithm):
+            model.save_replay_buffer(os.path.join(self.save_path, "replay_buffer.pkl"))

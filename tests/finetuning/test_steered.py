@@ -1,0 +1,209 @@
+"""A DTFM and its steering as one model."""
+
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+import torch as th
+from sb3_contrib import TQC
+from stable_baselines3 import A2C, PPO, SAC, TD3
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_dtfm import DTFM
+from sb3_dtfm.files import ModelFileError
+from sb3_dtfm.finetuning import NoiseActionVecEnv, SteeredDTFM
+from sb3_dtfm.policies.exported import ExportedPolicy
+from sb3_dtfm.windows import Context, Windows
+from tests.algorithms.small import make_model
+from tests.finetuning.test_noise_env import CHUNKS, make_venv, table_noise
+
+OFF_POLICY = dict(learning_starts=6, batch_size=8)
+QUICK = {SAC: OFF_POLICY, TQC: OFF_POLICY, PPO: dict(n_steps=4, batch_size=4, n_epochs=1), A2C: dict(n_steps=4)}
+
+
+@pytest.fixture(scope="module")
+def model(cheetah_buffer):
+    return make_model(DTFM, cheetah_buffer, ema_decay=0.9, policy_kwargs=CHUNKS).learn(5)
+
+
+def make_agent(model, algorithm=SAC, hidden_state=False, **kwargs):
+    env = NoiseActionVecEnv(make_venv(), model, hidden_state=hidden_state)
+    small = dict(device="cpu", seed=0, policy_kwargs=dict(net_arch=[16, 8]))
+    return algorithm("MlpPolicy", env, **{**small, **QUICK.get(algorithm, {}), **kwargs})
+
+
+@pytest.fixture(scope="module")
+def agent(model):
+    return make_agent(model, hidden_state=True).learn(30)
+
+
+@pytest.mark.parametrize(("algorithm", "hidden_state"), [(SAC, False), (SAC, True), (TQC, False), (PPO, False), (A2C, True)])
+def test_noise_is_a_draw_of_the_actors_own_distribution(model, algorithm, hidden_state):
+    """The actor's mean and standard deviation, as Stable-Baselines3 computes them, and the row of the noise table."""
+    agent = make_agent(model, algorithm, hidden_state).learn(30)
+    steered = SteeredDTFM.of(model, agent)
+    env = NoiseActionVecEnv(make_venv(), model, hidden_state=hidden_state)
+    shown = th.as_tensor(env.reset())
+    drawn = th.as_tensor(table_noise(model.policy, env._known[0]))
+    with th.no_grad():
+        if algorithm in (SAC, TQC):
+            mean, log_std, _ = agent.actor.get_action_dist_params(shown)
+            expected = 1.5 * (mean + log_std.exp() * drawn).tanh()
+        else:
+            distribution = agent.policy.get_distribution(shown).distribution
+            expected = (distribution.mean + distribution.stddev * drawn).clamp(-1.5, 1.5)
+    th.testing.assert_close(steered.policy.steering(shown, drawn), expected)
+    _, context = model.policy.act_from_noise(*env._known, expected.numpy())
+    observations = make_venv().reset()
+    actions, _ = steered.predict(observations, episode_start=np.ones(3, bool), deterministic=True)
+    np.testing.assert_allclose(actions, model.policy._to_environment(context.actions[:, -1]), atol=1e-5)
+
+
+def test_a_steered_model_plays_in_the_environment_what_its_noise_plays_in_the_wrapper(model, agent):
+    steered = SteeredDTFM.of(model, agent)
+    plain, state, starts = make_venv(), None, np.ones(3, bool)
+    observations, expected = plain.reset(), [[], [], []]
+    for _ in range(20):
+        actions, state = steered.predict(observations, state, starts, deterministic=True)
+        observations, _, starts, infos = plain.step(actions)
+        for row in np.flatnonzero(starts):
+            expected[row].append(infos[row]["episode"]["r"])
+    env = NoiseActionVecEnv(make_venv(), model, hidden_state=True)
+    shown, found = env.reset(), [[], [], []]
+    for _ in range(20):
+        with th.no_grad():
+            drawn = th.as_tensor(table_noise(model.policy, env._known[0]))
+            noise = steered.policy.steering(th.as_tensor(shown), drawn).numpy()
+        shown, _, dones, infos = env.step(noise)
+        for row in np.flatnonzero(dones):
+            found[row].append(infos[row]["terminal_observation"][17] * model.policy.normalization.return_scale.item())
+    for row in range(3):
+        assert len(expected[row]) >= 2
+        reached = 5.0 - np.array(found[row][: len(expected[row])])
+        np.testing.assert_allclose(reached, expected[row], atol=1e-3)
+
+
+def test_a_file_holds_both_and_nothing_that_is_run(model, agent, tmp_path):
+    steered = SteeredDTFM.of(model, agent)
+    steered.save(tmp_path / "steered")
+    loaded = SteeredDTFM.load(tmp_path / "steered")
+    assert loaded.steering == steered.steering
+    assert loaded.steering["layers"] == [16, 8]
+    observations = make_venv().reset()
+    for deterministic in (True, False):
+        actions, state = steered.predict(observations, episode_start=np.ones(3, bool), deterministic=deterministic)
+        again, other = loaded.predict(observations, episode_start=np.ones(3, bool), deterministic=deterministic)
+        np.testing.assert_array_equal(actions, again)
+        for ours, theirs in zip(state, other, strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+    names = zipfile.ZipFile(tmp_path / "steered.zip").namelist()
+    assert not [name for name in names if name.endswith((".pth", ".pkl", "data"))]
+    with pytest.raises(ModelFileError, match="steering"):
+        DTFM.load(tmp_path / "steered")
+
+
+def test_without_a_steering_it_is_the_dtfm(model, tmp_path):
+    SteeredDTFM.of(model).save(tmp_path / "unsteered")
+    observations = make_venv().reset()
+    expected, _ = model.predict(observations, episode_start=np.ones(3, bool), deterministic=True)
+    for cls, path in ((SteeredDTFM, tmp_path / "unsteered"), (DTFM, tmp_path / "unsteered")):
+        actions, _ = cls.load(path).predict(observations, episode_start=np.ones(3, bool), deterministic=True)
+        np.testing.assert_array_equal(actions, expected)
+
+
+def test_the_model_that_is_steered_stays_as_it_is(model, agent):
+    observations = make_venv().reset()
+    before, _ = model.predict(observations, episode_start=np.ones(3, bool), deterministic=True)
+    steered = SteeredDTFM.of(model, agent)
+    assert model.policy.steering is None
+    assert not any(parameter.requires_grad for parameter in steered.policy.steering.parameters())
+    actions, _ = steered.predict(observations, episode_start=np.ones(3, bool), deterministic=True)
+    assert np.abs(actions - before).max() > 1e-4
+    again, _ = model.predict(observations, episode_start=np.ones(3, bool), deterministic=True)
+    np.testing.assert_array_equal(again, before)
+
+
+def test_later_weights_of_the_agent_are_taken_over_when_asked(model):
+    agent = make_agent(model).learn(12)
+    steered = SteeredDTFM.of(model, agent)
+    before = steered.policy.steering.mean.weight.clone()
+    agent.learn(12)
+    th.testing.assert_close(steered.policy.steering.mean.weight, before, rtol=0, atol=0)
+    steered.steer(agent)
+    th.testing.assert_close(steered.policy.steering.mean.weight, agent.actor.mu.weight.detach(), rtol=0, atol=0)
+
+
+def test_other_actors_are_refused_by_name(model):
+    cases = [
+        (make_agent(model, TD3), "The actor of TD3 cannot be taken over: it is a TD3"),
+        (make_agent(model, use_sde=True), r"use_sde"),
+        (make_agent(model, PPO, policy_kwargs=dict(activation_fn=th.nn.Softplus)), "expected linear layers"),
+        (SAC("MlpPolicy", "Pendulum-v1", device="cpu"), "it does not learn in a NoiseActionVecEnv"),
+        (
+            SAC("MlpPolicy", VecNormalize(NoiseActionVecEnv(make_venv(), model)), device="cpu"),
+            "VecNormalize stands between",
+        ),
+    ]
+    for agent, message in cases:
+        with pytest.raises(ValueError, match=message):
+            SteeredDTFM.of(model, agent)
+    with pytest.raises(ValueError, match="does not learn from data"):
+        SteeredDTFM.of(model).learn(1)
+
+
+BAD_SETTINGS = [
+    ({"layers": [16, 9]}, "steering.*shape"),
+    ({"layers": [1] * 33}, "layers must be at most 32"),
+    ({"layers": "16"}, "layers must be at most 32"),
+    ({"activation": "Softplus"}, "activation must be one of ReLU"),
+    ({"bound": -1.0}, "bound must be a number above 0"),
+    ({"squashed": 1}, "squashed must be one of True, False"),
+    ({"hidden_state": False}, "steering.*shape"),
+    ({"more": 1}, "No settings of a steering"),
+]
+
+
+@pytest.mark.parametrize(("changed", "message"), BAD_SETTINGS)
+def test_a_file_whose_steering_is_damaged_is_refused(model, agent, tmp_path, changed, message):
+    file = io.BytesIO()
+    SteeredDTFM.of(model, agent).save(file)
+    with zipfile.ZipFile(file) as archive, zipfile.ZipFile(tmp_path / "damaged.zip", "w") as damaged:
+        for name in archive.namelist():
+            content = archive.read(name)
+            if name == "model.json":
+                configuration = json.loads(content)
+                configuration["attributes"]["steering"].update(changed)
+                content = json.dumps(configuration).encode()
+            damaged.writestr(name, content)
+    with pytest.raises(ModelFileError, match=message):
+        SteeredDTFM.load(tmp_path / "damaged.zip")
+
+
+@pytest.mark.slow
+def test_an_exported_file_acts_as_the_steered_model_does(model, agent, tmp_path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    from sb3_dtfm.cli.main import main
+
+    steered = SteeredDTFM.of(model, agent)
+    steered.save(tmp_path / "steered")
+    assert main(["export", str(tmp_path / "steered.zip"), "-o", str(tmp_path / "steered.onnx")]) == 0
+    exported = ExportedPolicy(steered.policy)
+    inputs = exported.example(3)
+    for noise in (inputs["noise"], th.zeros_like(inputs["noise"])):
+        inputs = {**inputs, "noise": noise}
+        session = onnxruntime.InferenceSession(tmp_path / "steered.onnx")
+        (chunk,) = session.run(["chunk"], {name: each.numpy() for name, each in inputs.items()})
+        np.testing.assert_allclose(chunk, exported(**inputs)[0].numpy(), atol=1e-4)
+    observations = make_venv().reset()
+    _, state = steered.predict(observations, episode_start=np.ones(3, bool), deterministic=True)
+    of_a_first_step = {
+        **{name: th.from_numpy(each) for name, each in zip(Windows._fields, state, strict=False)},
+        "actions": model.policy.normalization.unscale_action(th.zeros(3, 5, 6)),
+        "noise": th.zeros_like(inputs["noise"]),
+        "episode_keys": th.from_numpy(state[Context._fields.index("episode_keys")]),
+    }
+    (chunk,) = session.run(["chunk"], {name: each.numpy() for name, each in of_a_first_step.items()})
+    actions, _ = steered.predict(observations, episode_start=np.ones(3, bool), deterministic=True)
+    np.testing.assert_allclose(chunk[:, 0], actions, atol=1e-4)

@@ -1,0 +1,190 @@
+"""Values of a chain that are known, and the choice of the better of two ways."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+
+from sb3_dtfm import DT, DTFM
+from sb3_dtfm.data import Trajectory, TrajectoryBuffer
+from sb3_dtfm.files import ModelFileError
+from sb3_dtfm.policies.critic import Critic
+from tests.algorithms.small import make_model, record_curves
+
+SPACE = spaces.Box(-1.0, 1.0, (1,), np.float32)
+N_STATES, GAMMA = 4, 0.8
+
+
+def chain() -> TrajectoryBuffer:
+    """
+    From state 0 to 3: going on costs nothing and is worth 1 at the end; giving up is worth 0.3, and ends it.
+
+    People go on three times of four, from any state.
+    """
+    random = np.random.default_rng(0)
+    episodes = []
+    for number in range(400):
+        states, actions, rewards = [number % N_STATES], [], []
+        while len(rewards) == 0 or rewards[-1] == 0:
+            goes_on = random.uniform() < 0.75
+            actions.append([0.5 if goes_on else -0.5])
+            rewards.append(float(states[-1] == N_STATES - 1) if goes_on else 0.3)
+            states.append(states[-1] + 1)
+        observations = np.eye(N_STATES)[states[:-1]]
+        episodes.append(Trajectory(observations, np.array(actions), np.array(rewards), terminated=True))
+    return TrajectoryBuffer.from_trajectories(episodes, SPACE)
+
+
+def values(critic: Critic) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """In each state: of going on, of giving up, and V; in units of reward."""
+    states = th.eye(N_STATES)
+    with th.no_grad():
+        on, up = (critic(states, th.full((N_STATES, 1), action)) for action in (0.5, -0.5))
+        return tuple((each / critic.reward_scale).numpy() for each in (on, up, critic.value(states).squeeze(1)))
+
+
+@pytest.mark.parametrize("expectile", [0.5, 0.95])
+def test_values_of_a_chain(expectile):
+    buffer = chain()
+    th.manual_seed(0)
+    critic = Critic(N_STATES, 1, hidden_dim=32, expectile=expectile)
+    critic.optimizer.param_groups[0]["lr"] = 3e-3
+    critic.set_scale(buffer.largest_discounted_return(GAMMA))
+    generator = th.Generator().manual_seed(0)
+    for _ in range(1_500):
+        critic.learn(buffer.sample_transitions(64, 1, GAMMA, generator))
+    expected = np.zeros(N_STATES + 1)  # V, from the end on
+    for state in reversed(range(N_STATES)):
+        on = 1.0 if state == N_STATES - 1 else GAMMA * expected[state + 1]
+        expected[state] = weighed(on, 0.3, expectile)
+    going_on = np.append(GAMMA * expected[1:N_STATES], 1.0)
+    on, up, value = values(critic)
+    np.testing.assert_allclose(on, going_on, atol=0.05)
+    np.testing.assert_allclose(up, 0.3, atol=0.05)
+    np.testing.assert_allclose(value, expected[:N_STATES], atol=0.05)
+
+
+def weighed(on: float, up: float, expectile: float) -> float:
+    """The expectile v of two values, three times of four the first: sum of p |tau - 1(q < v)| (q - v) = 0."""
+    best, worst, p = (on, up, 0.75) if on > up else (up, on, 0.25)
+    high, low = p * expectile, (1 - p) * (1 - expectile)
+    return (high * best + low * worst) / (high + low)
+
+
+@pytest.fixture(scope="module")
+def two_ways() -> TrajectoryBuffer:
+    """Left or right as a coin decides, whatever is seen; right is worth 1."""
+    random = np.random.default_rng(0)
+    sides = random.choice((-1, 1), 400)
+    seen = random.normal(size=(400, 3))
+    return TrajectoryBuffer.from_trajectories(
+        [
+            Trajectory(seen[i : i + 1], np.full((1, 1), 0.6 * side), np.array([side > 0], float), terminated=True)
+            for i, side in enumerate(sides)
+        ],
+        SPACE,
+    )
+
+
+SETTINGS = dict(context_length=1, batch_size=64, learning_rate=1e-2)
+
+
+def guided(buffer: TrajectoryBuffer, **policy_kwargs) -> DTFM:
+    kwargs = dict(critic_steps=1, dropout=0.0, flow_prediction="action", one_step=False, n_solver_steps=8, **policy_kwargs)
+    return make_model(DTFM, buffer, policy_kwargs=kwargs, **SETTINGS)
+
+
+def went_right(model: DTFM, deterministic: bool = True) -> float:
+    """Share of 200 starts; what is asked for is what both ways have in the middle."""
+    random = np.random.default_rng(1)
+    observations = {
+        "observation": random.normal(size=(200, 3)).astype(np.float32),
+        "return_to_go": np.full((200, 1), 0.5, np.float32),
+        "timestep": np.zeros((200, 1), np.int64),
+    }
+    actions, _ = model.predict(observations, deterministic=deterministic)
+    return float((actions > 0).mean())
+
+
+@pytest.fixture(scope="module")
+def decided(two_ways) -> DTFM:
+    """Returns-to-go tell the ways apart, so the policy is to see none."""
+    blind = TrajectoryBuffer(
+        {name: getattr(two_ways, name).clone() for name in ("observations", "actions", "rewards", "returns_to_go")},
+        two_ways.episodes,
+        two_ways.observation_space,
+        two_ways.action_space,
+        "two ways",
+    )
+    blind.returns_to_go.fill_(0.5)
+    return guided(blind).learn(600, log_interval=None)
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_the_critic_takes_the_better_of_two_ways(decided, deterministic):
+    decided.policy.set_acting(n_candidates=1)
+    assert 0.3 < went_right(decided, deterministic) < 0.7
+    decided.policy.set_acting(n_candidates=8, temperature=0.0)
+    assert went_right(decided, deterministic) > 0.95
+    decided.policy.set_acting(temperature=1e6)  # chance alone
+    assert 0.3 < went_right(decided, deterministic) < 0.7
+
+
+def test_a_choice_repeats_and_is_saved(decided, tmp_path):
+    decided.policy.set_acting(n_candidates=4, temperature=0.1)
+    decided.save(tmp_path / "model.zip")
+    loaded = DTFM.load(tmp_path / "model.zip")
+    assert loaded.policy.acting_settings() == decided.policy.acting_settings()
+    assert went_right(loaded) == went_right(decided) == went_right(decided)
+
+
+def test_trunk_and_flow_learn_as_without(cheetah_buffer):
+    plain, guided = (
+        make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=n, chunk_size=3)).learn(5) for n in (0, 2)
+    )
+    for name, weight in plain.policy.network.state_dict().items():
+        assert th.equal(guided.policy.network.state_dict()[name], weight), name
+
+
+def test_going_on_is_the_same_to_the_bit(cheetah_buffer, tmp_path):
+    def make() -> DTFM:
+        return make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=1, chunk_size=3))
+
+    straight = make().learn(8)
+    half = make()
+    half.learn(4).save(tmp_path / "half.zip")
+    resumed = DTFM.load(tmp_path / "half.zip", dataset=cheetah_buffer).learn(4, reset_num_timesteps=False)
+    for name, weight in straight.policy.state_dict().items():
+        assert th.equal(resumed.policy.state_dict()[name], weight), name
+    ours, theirs = (model.policy.critic.optimizer.state_dict()["state"] for model in (resumed, straight))
+    assert all(th.equal(ours[i][name], theirs[i][name]) for i in theirs for name in theirs[i])
+
+
+def test_values_are_logged(cheetah_buffer):
+    model = make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=1, n_candidates=4))
+    curves = record_curves(model)
+    model.learn(4, log_interval=2)
+    for name in ("critic_loss", "value_loss", "q_value", "guided_share"):
+        points = curves.points[f"train/{name}"]
+        assert [step for step, _ in points] == [2, 4]
+        assert np.isfinite([value for _, value in points]).all()
+    assert 0 <= curves.points["train/guided_share"][-1][1] <= 1
+
+
+def test_what_cannot_choose_says_why(cheetah_buffer):
+    with pytest.raises(ValueError, match="critic_steps=1: the critic has nothing to choose among: DT makes one action"):
+        make_model(DT, cheetah_buffer, policy_kwargs=dict(critic_steps=1))
+    with pytest.raises(
+        ValueError, match=r"n_candidates=4 needs a model that was trained with policy_kwargs=dict\(critic_steps="
+    ):
+        make_model(DTFM, cheetah_buffer, policy_kwargs=dict(n_candidates=4))
+    model = make_model(DTFM, cheetah_buffer)
+    with pytest.raises(ValueError, match="n_candidates=2 needs"):
+        model.policy.set_acting(n_candidates=2)
+
+
+def test_a_file_without_its_critic_is_refused(cheetah_buffer, tmp_path):
+    make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=1)).learn(1).save(tmp_path / "guided.zip")
+    plain = make_model(DTFM, cheetah_buffer).learn(1)
+    with pytest.raises(ModelFileError, match="critic"):
+        plain.set_parameters(str(tmp_path / "guided.zip"))

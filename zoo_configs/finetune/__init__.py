@@ -1,0 +1,1 @@
+"""Settings of the online algorithms that steer a frozen DTFM."""
