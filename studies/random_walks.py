@@ -10,9 +10,11 @@ and none of those that begin where a model will have to begin gets there.
     sb3-dtfm benchmark $(python studies/random_walks.py arguments) --seeds 0 1 2 --algo dtfm --label critic \
         -params "policy_kwargs:dict(chunk_size=4,dropout=0.0,critic_steps=10,expectile=0.9,gamma=0.98,n_candidates=8)"
     python studies/random_walks.py plot --dt dt.zip --dtfm dtfm.zip
+    OMP_NUM_THREADS=1 python studies/random_walks.py cost --dtfm dtfm.zip
 """
 
 import argparse
+import time
 from pathlib import Path
 
 import gymnasium as gym
@@ -22,6 +24,7 @@ from mazes import ENV_ID, WALL, Path2D, draw, model_paths
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_dtfm import DT, DTFM
+from sb3_dtfm.envs import TIMESTEP, ReturnToGoWrapper
 from sb3_dtfm.recording.agent import episode_seeds
 from sb3_dtfm.recording.episodes import EpisodeRecorder, run_episodes
 from sb3_dtfm.recording.minari import check_dataset_id, write_minari
@@ -39,6 +42,7 @@ WALKED = [[START if cell == FREE else cell for cell in row] for row in MAZE]
 DATASET_ID = "local/pointmaze/random-walks-v0"
 N_STEPS = 50  # of a walk
 ENV_KWARGS = {"maze_map": MAZE, "continuing_task": False, "max_episode_steps": 300}  # of an evaluation
+CANDIDATES, N_REPEATS = (1, 8, 32), 5  # of `cost`
 TURN = 0.15  # probability with which a walk takes another direction at a step
 
 
@@ -89,9 +93,28 @@ def began_at_start(positions: np.ndarray) -> bool:
     return bool(positions[0][0] < -0.5 and positions[0][1] > 0.5)
 
 
+def cost(model: DTFM, n_actions: int = 400) -> None:
+    """Print the milliseconds of an action, of as many candidates as the critic chooses among, in turn."""
+    env = ReturnToGoWrapper(gym.make(ENV_ID, **ENV_KWARGS), target_return=1.0)
+    observation, _ = env.reset(seed=0)
+    milliseconds: dict[int, list[float]] = {n: [] for n in CANDIDATES}
+    for _ in range(N_REPEATS):
+        for n_candidates, times in milliseconds.items():
+            model.policy.set_acting(n_candidates=n_candidates)
+            state, start = None, np.ones(1, bool)
+            began = time.perf_counter()
+            for timestep in range(n_actions):
+                _, state = model.predict({**observation, TIMESTEP: np.array([timestep])}, state, start, deterministic=True)
+                start = np.zeros(1, bool)
+            times.append(1000 * (time.perf_counter() - began) / n_actions)
+    print("| candidates | ms an action |\n| --- | --- |")
+    for n_candidates, times in milliseconds.items():
+        print(f"| {n_candidates} | {np.median(times):.2f} |")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("record", "arguments", "plot"))
+    parser.add_argument("what", choices=("record", "arguments", "plot", "cost"))
     parser.add_argument("--episodes", type=int, help="1000 to record, 50 to plot by default")
     parser.add_argument("--dt", type=Path, help="a trained DT")
     parser.add_argument("--dtfm", type=Path, help="a trained DTFM with a critic, which is drawn without and with it")
@@ -104,6 +127,8 @@ def main() -> None:
         alone.policy.set_acting(n_candidates=1)
         models = {"DT": DT.load(options.dt), "DTFM": alone, "DTFM with critic": guided}
         plot(models, options.episodes or 50, options.output)
+    elif options.what == "cost":
+        cost(DTFM.load(options.dtfm, device="cpu"))
     else:
         env_kwargs = [f"{key}:{value!r}".replace(" ", "") for key, value in ENV_KWARGS.items()]
         data = ["--dataset", f"{ENV_ID}={DATASET_ID}", "--target-return", "1", "--fractions", "1.0"]
