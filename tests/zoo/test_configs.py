@@ -118,7 +118,7 @@ def test_a_search_can_find_the_packaged_settings(algo, settings):
         for key in {"solver", "one_step"} & set(policy_kwargs):  # not searched for: neither changes what the rest learns
             del policy_kwargs[key]
         packaged = {"ema_decay": 0.0, **defaults, **hyperparams, **policy_kwargs}
-        powers = {f"{key}_pow": int(np.log2(value)) for key, value in packaged.items() if type(value) is int}
+        powers = {f"{key}_pow": int(np.log2(value)) for key, value in packaged.items() if type(value) is int and value > 0}
         sampled = HYPERPARAMS_SAMPLER[algo](optuna.trial.FixedTrial({**packaged, **powers}), 0, 1, {})
         assert sampled.pop("policy_kwargs").items() >= policy_kwargs.items()
         assert sampled.items() <= packaged.items()
