@@ -53,10 +53,8 @@ def test_two_models_are_asked_for_the_range_of_their_data(workplace, capsys):
     assert main(["sweep", *slower, "speed:7"]) == 2
     errors = capsys.readouterr().err
     assert "--acting: n_solver_steps" in errors
-    assert (
-        "--acting: speed: no way of acting; accepted are kv_cache, n_action_steps, n_candidates, temperature, solver, n_solver_steps."
-        in errors
-    )
+    accepted = "kv_cache, n_action_steps, n_candidates, temperature, solver, n_solver_steps"
+    assert f"--acting: speed: no way of acting; accepted are {accepted}." in errors
 
 
 @pytest.mark.parametrize(
