@@ -1,4 +1,4 @@
-"""A ball in a maze: the ways that models take, and a picture of ways."""
+"""A ball in a maze: the ways that models take, a picture of ways, and what the benchmark is told."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,10 +9,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_dtfm.benchmark.evaluation import FINAL_STATES
-from sb3_dtfm.envs import OBSERVATION, ReturnToGoWrapper, register_gymnasium_robotics
+from sb3_dtfm.envs import ReturnToGoWrapper, register_gymnasium_robotics
+from sb3_dtfm.recording.agent import agent_actions
+from sb3_dtfm.recording.episodes import EpisodeRecorder, run_episodes
 
 register_gymnasium_robotics()
 ENV_ID = "PointMaze_UMaze-v3"
@@ -35,21 +36,20 @@ def model_paths(model: BaseAlgorithm, env_kwargs: dict[str, Any], n_episodes: in
 
     :param env_kwargs: of the environment
     """
-    vec_env = DummyVecEnv([lambda: ReturnToGoWrapper(gym.make(ENV_ID, **env_kwargs), target_return=1.0)] * n_episodes)
-    vec_env.seed(FINAL_STATES)
-    observations: Any = vec_env.reset()
-    state, start, arrived = None, np.ones(n_episodes, bool), np.zeros(n_episodes, bool)
-    positions: list[list[np.ndarray]] = [[each[:2]] for each in observations[OBSERVATION]]
-    running = np.ones(n_episodes, bool)
-    while running.any():
-        actions, state = model.predict(observations, state, start, deterministic=True)
-        observations, _, start, infos = vec_env.step(actions)
-        for i in np.flatnonzero(running):
-            last = infos[i]["terminal_observation"][OBSERVATION] if start[i] else observations[OBSERVATION][i]
-            positions[i].append(last[:2])
-            arrived[i] = start[i] and not infos[i]["TimeLimit.truncated"]
-        running &= ~start
-    return [Path2D(np.array(way), bool(there)) for way, there in zip(positions, arrived, strict=True)]
+    envs = [ReturnToGoWrapper(EpisodeRecorder(gym.make(ENV_ID, **env_kwargs)), target_return=1.0) for _ in range(n_episodes)]
+    seeds = range(FINAL_STATES, FINAL_STATES + n_episodes)
+    episodes = run_episodes(envs, agent_actions(model, None, deterministic=True), seeds)
+    return [
+        Path2D(np.array([each["achieved_goal"] for each in episode.observations]), episode.terminated)
+        for episode in episodes
+    ]
+
+
+def benchmark_arguments(dataset_id: str, env_kwargs: dict[str, Any], *others: str) -> str:
+    """What `sb3-dtfm benchmark` is told of a maze and its demonstrations, asked for a return of 1."""
+    words = [f"{key}:{value!r}".replace(" ", "") for key, value in env_kwargs.items()]
+    data = ["--dataset", f"{ENV_ID}={dataset_id}", "--target-return", "1", "--fractions", "1.0"]
+    return " ".join([*data, *others, "--env-kwargs", *words])
 
 
 def draw(

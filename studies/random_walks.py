@@ -14,17 +14,16 @@ and none of those that begin where a model will have to begin gets there.
 """
 
 import argparse
-import time
 from pathlib import Path
 
 import gymnasium as gym
 import minari
 import numpy as np
-from mazes import ENV_ID, WALL, Path2D, draw, model_paths
+from mazes import ENV_ID, WALL, Path2D, benchmark_arguments, draw, model_paths
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_dtfm import DT, DTFM
-from sb3_dtfm.envs import TIMESTEP, ReturnToGoWrapper
+from sb3_dtfm.benchmark.evaluation import action_ms, make_seeded_envs
 from sb3_dtfm.recording.agent import episode_seeds
 from sb3_dtfm.recording.episodes import EpisodeRecorder, run_episodes
 from sb3_dtfm.recording.minari import check_dataset_id, write_minari
@@ -93,20 +92,15 @@ def began_at_start(positions: np.ndarray) -> bool:
     return bool(positions[0][0] < -0.5 and positions[0][1] > 0.5)
 
 
-def cost(model: DTFM, n_actions: int = 400) -> None:
-    """Print the milliseconds of an action, of as many candidates as the critic chooses among, in turn."""
-    env = ReturnToGoWrapper(gym.make(ENV_ID, **ENV_KWARGS), target_return=1.0)
-    observation, _ = env.reset(seed=0)
+def cost(model: DTFM) -> None:
+    """Print the milliseconds of an action by the number of candidates that the critic chooses among, in turn."""
+    wrapper = {"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 1.0}}
+    env = make_seeded_envs(ENV_ID, {"env_wrapper": wrapper, "env_kwargs": ENV_KWARGS}, n_envs=1)
     milliseconds: dict[int, list[float]] = {n: [] for n in CANDIDATES}
-    for _ in range(N_REPEATS):
+    for seed in range(N_REPEATS):
         for n_candidates, times in milliseconds.items():
             model.policy.set_acting(n_candidates=n_candidates)
-            state, start = None, np.ones(1, bool)
-            began = time.perf_counter()
-            for timestep in range(n_actions):
-                _, state = model.predict({**observation, TIMESTEP: np.array([timestep])}, state, start, deterministic=True)
-                start = np.zeros(1, bool)
-            times.append(1000 * (time.perf_counter() - began) / n_actions)
+            times.append(action_ms(model, env, seed))
     print("| candidates | ms an action |\n| --- | --- |")
     for n_candidates, times in milliseconds.items():
         print(f"| {n_candidates} | {np.median(times):.2f} |")
@@ -130,9 +124,8 @@ def main() -> None:
     elif options.what == "cost":
         cost(DTFM.load(options.dtfm, device="cpu"))
     else:
-        env_kwargs = [f"{key}:{value!r}".replace(" ", "") for key, value in ENV_KWARGS.items()]
-        data = ["--dataset", f"{ENV_ID}={DATASET_ID}", "--target-return", "1", "--fractions", "1.0"]
-        print(*data, "-n", "2000", "--eval-freq", "1000", "--final-episodes", "100", "--env-kwargs", *env_kwargs)
+        others = ["-n", "2000", "--eval-freq", "1000", "--final-episodes", "100"]
+        print(benchmark_arguments(DATASET_ID, ENV_KWARGS, *others))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from pathlib import Path
 import gymnasium as gym
 import minari
 import numpy as np
-from mazes import ENV_ID, Path2D, draw, model_paths
+from mazes import ENV_ID, Path2D, benchmark_arguments, draw, model_paths
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_dtfm import DT, DTFM
@@ -93,9 +93,7 @@ def main() -> None:
     elif options.what == "plot":
         plot({"DT": DT.load(options.dt), "DTFM": DTFM.load(options.dtfm)}, options.episodes or 50, options.output)
     else:
-        env_kwargs = [f"{key}:{value!r}".replace(" ", "") for key, value in ENV_KWARGS.items()]
-        data = ["--dataset", f"{ENV_ID}={DATASET_ID}", "--target-return", "1", "--fractions", "1.0"]
-        print(*data, "-n", "1000", "--label", "two-ways", "--env-kwargs", *env_kwargs)
+        print(benchmark_arguments(DATASET_ID, ENV_KWARGS, "-n", "1000", "--label", "two-ways"))
 
 
 if __name__ == "__main__":

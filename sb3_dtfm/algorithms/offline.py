@@ -184,17 +184,19 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
             self.policy.update_ema(min(self.ema_decay, (1 + self._n_updates) / (10 + self._n_updates)))
 
     def _learn_values(self) -> dict[str, th.Tensor]:
-        """The critic's gradient steps, the same on every process; what is logged of the last one."""
-        critic = self.policy.critic
+        """The critic's gradient steps, the same on every process; means of what is logged."""
+        critic, n_steps = self.policy.critic, self.policy.critic_steps
         if critic is None:
             return {}
         assert self.buffer is not None
         assert self._training_seed is not None
         generator = th.Generator(self.device).manual_seed(step_seed(self._training_seed, self._n_updates, TRANSITIONS))
-        for _ in range(self.policy.critic_steps):
+        sums: dict[str, th.Tensor] = {}
+        for _ in range(n_steps):
             batch = self.buffer.sample_transitions(critic.batch_size, self.policy.n_valued, self.policy.gamma, generator)
             parts = critic.learn(self.policy.normalization.scale_transitions(batch))
-        return parts
+            sums = {name: sums.get(name, 0.0) + part for name, part in parts.items()}
+        return {name: total / n_steps for name, total in sums.items()}
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         remaining = self._current_progress_remaining

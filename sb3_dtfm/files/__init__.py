@@ -1,4 +1,4 @@
-"""Files: how one is replaced, what a saved model is made of, and an exported one."""
+"""Files: how one is replaced, what a saved model is made of, and an exported one; what a run tells of its environment."""
 
 from sb3_dtfm.files.model import (
     ModelFile,
@@ -11,6 +11,7 @@ from sb3_dtfm.files.model import (
 )
 from sb3_dtfm.files.onnx import write_onnx
 from sb3_dtfm.files.replacing import find_leftovers, hidden_name, replacing
+from sb3_dtfm.files.run import read_run
 
 __all__ = [
     "ModelFile",
@@ -21,6 +22,7 @@ __all__ = [
     "holds_pickles",
     "read_configuration",
     "read_model",
+    "read_run",
     "replacing",
     "write_model",
     "write_onnx",

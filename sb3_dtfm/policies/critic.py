@@ -14,7 +14,6 @@ from sb3_dtfm.windows import Transitions
 # Kostrikov et al. (2022): how fast the network that backups look at follows, and the rate at which all learn.
 TARGET_SHARE = 0.005
 LEARNING_RATE = 3e-4
-BATCH_SIZE = 256
 # What the largest discounted return-to-go becomes.
 LARGEST_VALUE = 10.0
 # How fast the spread of advantages follows the batches.
@@ -35,7 +34,7 @@ class Critic(nn.Module):
     :param expectile: in (0.5, 1): 0.5 values the data's policy, near 1 the best of its actions, and luck with them
     """
 
-    batch_size = BATCH_SIZE
+    batch_size = 256
     reward_scale: th.Tensor
     spread: th.Tensor
 
@@ -82,13 +81,17 @@ class Critic(nn.Module):
         value_loss = _mean(weight * advantage.square(), batch.mask)
         errors = [(q(pairs).squeeze(-1) - backup).square() for q in self.q]
         critic_loss = _mean(errors[0] + errors[1], batch.mask)
-        self.spread.lerp_(_mean(advantage.detach().square(), batch.mask).sqrt(), SPREAD_SHARE)
-        parts = {"critic_loss": critic_loss, "value_loss": value_loss, "q_value": _mean(valued, batch.mask)}
-        return critic_loss + value_loss, parts
+        parts = {
+            "critic_loss": critic_loss,
+            "value_loss": value_loss,
+            "q_value": _mean(valued, batch.mask),
+            "advantage_spread": _mean(advantage.square(), batch.mask).sqrt(),
+        }
+        return critic_loss + value_loss, {name: part.detach() for name, part in parts.items()}
 
     def learn(self, batch: Transitions) -> dict[str, th.Tensor]:
         """
-        A gradient step; one whose loss is not finite changes nothing.
+        A gradient step. One whose loss is not finite leaves networks that learn, and the spread, as they are.
 
         :param batch: observations normalised, actions in [-1, 1]
         :return: what is logged
@@ -96,8 +99,10 @@ class Critic(nn.Module):
         loss, parts = self.loss(batch)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        self.optimizer.found_inf = (~th.isfinite(loss)).float().detach()  # type: ignore[attr-defined]
+        finite = th.isfinite(loss)
+        self.optimizer.found_inf = (~finite).float()  # type: ignore[attr-defined]
         self.optimizer.step()
+        self.spread.lerp_(th.where(finite, parts["advantage_spread"], self.spread), SPREAD_SHARE)
         # What backups look at moves towards what learns.
         followers = [parameter.data for parameter in self.q_target.parameters()]
         th._foreach_lerp_(followers, [parameter.data for parameter in self.q.parameters()], TARGET_SHARE)

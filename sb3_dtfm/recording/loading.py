@@ -21,7 +21,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_dtfm.algorithms import ALGORITHMS
-from sb3_dtfm.files import holds_pickles, read_configuration
+from sb3_dtfm.files import holds_pickles, read_configuration, read_run
 
 NOT_NORMALIZED = "none"
 
@@ -70,21 +70,14 @@ def _read_run(model: Path, run: Path) -> AgentFiles:
     """
     :param run: the folder beside the model that holds config.yml and args.yml
     """
-    try:
-        import yaml
-        from rl_zoo3.utils import get_saved_hyperparams, get_wrapper_class
-    except ImportError as error:
-        raise ImportError(f'{run} is an RL-Zoo run; to read it: pip install "sb3-dtfm[zoo]" ({error})') from error
-    hyperparams, _ = get_saved_hyperparams(str(run))
+    hyperparams = read_run(run)
+    from rl_zoo3.utils import get_wrapper_class  # an extra, which the line above has found
+
     for key in ("frame_stack", "vec_env_wrapper"):
         if hyperparams.get(key):
             raise ValueError(f"{run / 'config.yml'}: {key} is {hyperparams[key]!r}; agents trained so cannot be recorded.")
-    env_kwargs = hyperparams.get("env_kwargs") or {}
-    if (run / "args.yml").is_file():
-        arguments = yaml.load((run / "args.yml").read_text(), Loader=yaml.UnsafeLoader)
-        env_kwargs = arguments.get("env_kwargs") or env_kwargs  # of the command line, before those of the YAML file
     statistics = run / "vecnormalize.pkl" if hyperparams["normalize"] else None
-    return AgentFiles(model, dict(env_kwargs), get_wrapper_class(hyperparams), statistics)
+    return AgentFiles(model, dict(hyperparams["env_kwargs"]), get_wrapper_class(hyperparams), statistics)
 
 
 @functools.cache

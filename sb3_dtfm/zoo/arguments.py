@@ -117,6 +117,8 @@ def train_arguments(argv: Sequence[str]) -> list[str]:
     :raises UsageError: a shorthand for an algorithm that knows no dataset, or one that is missing
     """
     options, rest = train_parser().parse_known_args(argv)
+    if options.algo == STEERED:
+        raise UsageError(f"--algo {STEERED}: such models come from `sb3-dtfm finetune`; `enjoy` plays them.")
     given = key_values("-params", options.hyperparams)
     shorthands = _shorthands(options, given)
     if options.algo not in ALGORITHMS and shorthands:

@@ -6,8 +6,7 @@ from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
-import yaml
-from rl_zoo3.utils import get_latest_run_id, get_saved_hyperparams
+from rl_zoo3.utils import get_latest_run_id
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback, EvalCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -15,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dtfm.algorithms import DTFM
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
+from sb3_dtfm.files import read_run
 from sb3_dtfm.finetuning import NoiseActionVecEnv, SteeredDTFM
 from sb3_dtfm.zoo.arguments import UsageError
 from sb3_dtfm.zoo.manager import OfflineExperimentManager
@@ -24,18 +24,6 @@ from sb3_dtfm.zoo.registration import STEERED
 NOISE_ENV = "noise_env"
 # The online algorithm itself, as Stable-Baselines3 saves it.
 AGENT = "agent"
-
-
-def _environment_of(run: Path) -> dict[str, Any]:
-    """
-    What a run's environment was made with, as `enjoy` finds it.
-
-    :param run: the folder that holds its config.yml and args.yml, or does not exist
-    """
-    known = get_saved_hyperparams(str(run))[0] if (run / "config.yml").is_file() else {}
-    arguments = yaml.load((run / "args.yml").read_text(), Loader=yaml.UnsafeLoader) if (run / "args.yml").is_file() else {}
-    env_kwargs = arguments.get("env_kwargs") or known.get("env_kwargs")
-    return {"env_wrapper": known.get("env_wrapper"), "env_kwargs": env_kwargs}
 
 
 class SteeredCallbacks(BaseCallback):
@@ -124,10 +112,10 @@ class FinetuningManager(OfflineExperimentManager):
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """RL-Zoo's; what the environment was to the frozen policy comes from its run."""
         hyperparams, _ = super().read_hyperparameters()
-        known = _environment_of(self.base_file.parent / self.env_name)
-        if self.env_kwargs:  # of the command line
-            del known["env_kwargs"]
-        hyperparams = {**{key: value for key, value in known.items() if value}, **hyperparams}
+        run = self.base_file.parent / self.env_name
+        known = read_run(run) if (run / "config.yml").is_file() else {}
+        from_the_run = ["env_wrapper", *([] if self.env_kwargs else ["env_kwargs"])]  # of the command line, if given there
+        hyperparams = {**{key: known[key] for key in from_the_run if known.get(key)}, **hyperparams}
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = hyperparams.get("env_kwargs") or self.env_kwargs
         if self.target_return is not None:

@@ -99,4 +99,6 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
         capsys.readouterr()
         assert main([*FINETUNE, *arguments.split()]) == 2, arguments
         assert message in capsys.readouterr().err, arguments
+    assert main(["train", "--algo", "steered", "--env", "HalfCheetah-v5"]) == 2
+    assert "--algo steered: such models come from `sb3-dtfm finetune`" in capsys.readouterr().err
     assert not list((workplace / "logs").glob("steered/*"))

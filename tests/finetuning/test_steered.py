@@ -207,3 +207,14 @@ def test_an_exported_file_acts_as_the_steered_model_does(model, agent, tmp_path)
     (chunk,) = session.run(["chunk"], {name: each.numpy() for name, each in of_a_first_step.items()})
     actions, _ = steered.predict(observations, episode_start=np.ones(3, bool), deterministic=True)
     np.testing.assert_allclose(chunk[:, 0], actions, atol=1e-4)
+
+
+def test_a_steering_goes_before_a_critics_choice(cheetah_buffer):
+    """In the wrapper the algorithm's noise is what acts, so that has to be what the steered model does."""
+    guided = make_model(DTFM, cheetah_buffer, policy_kwargs=dict(CHUNKS, critic_steps=1, n_candidates=8)).learn(2)
+    steered = SteeredDTFM.of(guided, make_agent(guided).learn(30))
+    observations = make_venv().reset()
+    chosen, _ = steered.predict(observations, deterministic=True)
+    steered.policy.set_acting(n_candidates=1)
+    alone, _ = steered.predict(observations, deterministic=True, episode_start=np.ones(len(chosen), bool))
+    np.testing.assert_array_equal(chosen, alone)

@@ -9,6 +9,7 @@ from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.files import ModelFileError
 from sb3_dtfm.policies.critic import Critic
+from sb3_dtfm.windows import Context
 from tests.algorithms.small import make_model, record_curves
 
 SPACE = spaces.Box(-1.0, 1.0, (1,), np.float32)
@@ -62,6 +63,22 @@ def test_values_of_a_chain(expectile):
     np.testing.assert_allclose(on, going_on, atol=0.05)
     np.testing.assert_allclose(up, 0.3, atol=0.05)
     np.testing.assert_allclose(value, expected[:N_STATES], atol=0.05)
+
+
+def test_a_step_whose_loss_is_not_finite_is_not_learned_from():
+    """Not even by the spread, which a file with NaN in it would be refused for."""
+    buffer = chain()
+    th.manual_seed(0)
+    critic = Critic(N_STATES, 1, hidden_dim=8)
+    batch = buffer.sample_transitions(8, 1, GAMMA, th.Generator().manual_seed(0))
+    before = {name: tensor.clone() for name, tensor in critic.state_dict().items()}
+    parts = critic.learn(batch._replace(rewards=batch.rewards * np.inf))
+    assert not np.isfinite(float(parts["critic_loss"]))
+    for name, tensor in critic.state_dict().items():
+        assert th.equal(tensor, before[name]), name
+    critic.learn(batch)
+    assert not th.equal(critic.spread, before["spread"])
+    assert not th.equal(critic.value[0].weight, before["value.0.weight"])
 
 
 def weighed(on: float, up: float, expectile: float) -> float:
@@ -136,6 +153,38 @@ def test_a_choice_repeats_and_is_saved(decided, tmp_path):
     loaded = DTFM.load(tmp_path / "model.zip")
     assert loaded.policy.acting_settings() == decided.policy.acting_settings()
     assert went_right(loaded) == went_right(decided) == went_right(decided)
+
+
+@pytest.mark.parametrize("solver", ["euler", "one_step"])
+def test_of_the_draws_the_most_valuable_one_is_taken(cheetah_buffer, solver):
+    model = make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=3, chunk_size=3)).learn(4)
+    assert {int(state["step"]) for state in model.policy.critic.optimizer.state.values()} == {3 * 4}
+    random = np.random.default_rng(2)
+    observation = cheetah_buffer.observations[random.integers(len(cheetah_buffer.observations), size=50)]
+    observations = {
+        "observation": observation.numpy(),
+        "return_to_go": np.full((50, 1), 10.0, np.float32),
+        "timestep": np.zeros((50, 1), np.int64),
+    }
+    values = {}
+    for n_candidates in (1, 8, 32):
+        model.policy.set_acting(solver=solver, n_candidates=n_candidates)
+        _, state = model.predict(observations, deterministic=True, episode_start=np.ones(50, bool))
+        context = Context(*state)
+        planned = np.concatenate([context.actions[:, -1:], context.plan], axis=1)[:, : model.policy.n_valued].reshape(50, -1)
+        with th.no_grad():
+            seen = model.policy.normalization.scale_observation(observation)
+            values[n_candidates] = model.policy.critic(seen, th.from_numpy(planned)).numpy()
+    assert (values[8] >= values[1] - 1e-6).all()
+    assert (values[32] >= values[8] - 1e-6).all()
+    assert (values[32] > values[1] + 1e-4).mean() > 0.5
+
+
+def test_what_chooses_by_value_is_not_exported(cheetah_buffer, tmp_path):
+    model = make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=1, n_candidates=4))
+    with pytest.raises(ValueError, match="n_candidates=4: a choice by the critic is not exported"):
+        model.export(tmp_path / "policy.onnx")
+    assert not list(tmp_path.iterdir())
 
 
 def test_trunk_and_flow_learn_as_without(cheetah_buffer):
