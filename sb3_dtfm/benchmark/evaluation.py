@@ -43,23 +43,35 @@ class Episodes(NamedTuple):
 
 class SeededEpisodes(gym.Wrapper):
     """
-    Each episode starts from the seed that was set for it.
+    Each episode starts from the seed that was set for it, and after the last one of these the environment rests.
 
     A vector environment resets by itself and without a seed; what an episode starts from would then depend on those before.
+    And it steps all of its environments, those that nobody waits for, too. One that rests stands at a start and takes no time.
     """
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
         self._seeds: list[int] = []
+        self._start: tuple[Any, dict[str, Any]] | None = None
+        self._rests = False
 
     def set_episode_seeds(self, seeds: Sequence[int]) -> None:
         """
-        :param seeds: of the next episodes; those after them go on without one
+        :param seeds: of the next episodes
         """
         self._seeds = list(seeds)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        return self.env.reset(seed=self._seeds.pop(0) if self._seeds else seed, options=options)
+        self._rests = not self._seeds
+        if self._seeds or self._start is None:
+            self._start = self.env.reset(seed=self._seeds.pop(0) if self._seeds else seed, options=options)
+        return self._start
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        if self._rests:
+            assert self._start is not None
+            return self._start[0], 0.0, False, False, {}
+        return self.env.step(action)
 
 
 def make_seeded_envs(env_id: str, settings: dict[str, Any], n_envs: int, subprocesses: bool = False) -> VecEnv:
@@ -126,10 +138,11 @@ def action_ms(model: BaseAlgorithm, vec_env: VecEnv, seed: int) -> float:
     A mean, since of a chunk that is carried out only the first action takes time; a median, since other jobs interrupt.
 
     :param model: acts deterministically
-    :param vec_env: environments in :class:`SeededEpisodes`, which all do what the first one is told
+    :param vec_env: environments in :class:`SeededEpisodes`, the first of which acts
     :param seed: of the episode
     """
-    vec_env.env_method("set_episode_seeds", [seed])
+    for i in range(vec_env.num_envs):
+        vec_env.env_method("set_episode_seeds", [seed] * (TIMED_BLOCKS * TIMED_ACTIONS if i == 0 else 0), indices=i)
     observations, state, starts = vec_env.reset(), None, np.ones(1, bool)
     times = []
     for _ in range(TIMED_BLOCKS * TIMED_ACTIONS):

@@ -36,7 +36,7 @@ class Countdown(gym.Env):
 
     def __init__(self, success_key: str | None = "is_success") -> None:
         self.success_key = success_key
-        self.left = self.seed = 0
+        self.left = self.seed = self.n_steps = 0
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -45,6 +45,7 @@ class Countdown(gym.Env):
 
     def step(self, action):
         self.left -= 1
+        self.n_steps += 1
         info = {self.success_key: self.seed % 2 == 0} if self.success_key else {}
         return np.array([self.left], np.float32), 2.0, self.left == 0, False, info
 
@@ -76,6 +77,13 @@ def test_each_initial_state_counts_once_in_order(n_envs):
     assert episodes.successes == [False, False, False, True, False]
     assert model.deterministic
     assert model.starts[0].all()
+
+
+def test_environments_that_nobody_waits_for_are_not_stepped():
+    """Five environments for three episodes, of which one is far longer than the others."""
+    env = vec_env(5)
+    assert evaluate(Idle(), env, [2, 90, 3]).lengths == [2, 90, 3]
+    assert env.get_attr("n_steps") == [2, 90, 3, 0, 0]
 
 
 def test_evaluations_repeat_on_the_same_environments():
