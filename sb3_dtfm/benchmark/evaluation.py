@@ -46,7 +46,7 @@ class SeededEpisodes(gym.Wrapper):
     Each episode starts from the seed that was set for it, and after the last one of these the environment rests.
 
     A vector environment resets by itself and without a seed; what an episode starts from would then depend on those before.
-    And it steps all of its environments, those that nobody waits for, too. One that rests stands at a start and takes no time.
+    And it steps all of its environments, also those that nobody waits for. One that rests stands at a start.
     """
 
     def __init__(self, env: gym.Env) -> None:
