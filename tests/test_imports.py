@@ -45,7 +45,10 @@ ROOMS = {
             "files",
         },
     ),
-    "finetuning": ("sb3_dtfm/finetuning", {"finetuning", "algorithms", "arguments", "envs", "policies", "windows"}),
+    "finetuning": (
+        "sb3_dtfm/finetuning",
+        {"finetuning", "algorithms", "arguments", "data", "distributed", "envs", "policies", "windows"},
+    ),
     "zoo": (
         "sb3_dtfm/zoo",
         {"", "algorithms", "arguments", "policies", "callbacks", "envs", "distributed", "files", "finetuning", "zoo"},

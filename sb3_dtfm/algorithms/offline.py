@@ -16,6 +16,7 @@ from stable_baselines3.common.utils import configure_logger, update_learning_rat
 from sb3_dtfm.algorithms.base import OfflineAlgorithm
 from sb3_dtfm.arguments import POSITIVE
 from sb3_dtfm.callbacks import GradientStepProgressBar, NormalizedScoreCallback, find_eval_callbacks
+from sb3_dtfm.data import TrajectoryBuffer
 from sb3_dtfm.distributed import DataParallel, LossFunction, is_first_process
 from sb3_dtfm.optimization import (
     BATCHES,
@@ -28,7 +29,7 @@ from sb3_dtfm.optimization import (
     seed_default_generator,
     step_seed,
 )
-from sb3_dtfm.windows import Windows
+from sb3_dtfm.windows import Transitions, Windows
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineSequenceAlgorithm")
 
@@ -122,30 +123,14 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         parallel = DataParallel(self.policy, self._loss_function(), self.batch_size)
-        seed = self._training_seed = parallel.from_first(self._choose_training_seed())
-        generator = th.Generator(self.device)
-        batch_seeds = (step_seed(seed, n_updates, BATCHES) for n_updates in itertools.count(self._n_updates))
-        batches = buffer.batches(
-            self.batch_size,
-            self.context_length,
-            th.Generator(self.device),
-            self.timestep_exponent,
-            n_ahead=self.policy.chunk_size - 1,
-            return_weight=self.return_weight,
-            seeds=batch_seeds,
-        )
+        self._training_seed = parallel.from_first(self._choose_training_seed())
+        batches = self._batches(buffer, self.batch_size)
         callback.on_training_start(locals(), globals())
         parallel.from_first(True)  # which may evaluate for longer than a gradient step's messages wait
         while self.num_timesteps < total_timesteps:
-            step_start = time.perf_counter()
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
-            generator.manual_seed(step_seed(seed, self._n_updates, NOISE))
-            seed_default_generator(self.device, step_seed(seed, self._n_updates, DROPOUT, parallel.rank))
-            with self._memory_errors_named():
-                self._gradient_step(next(batches), generator, parallel)
+            self._train_step(batches, parallel)
             self.num_timesteps += 1
-            self._training_seconds += time.perf_counter() - step_start
-            self._timed_steps += 1
             if log_interval and (self.num_timesteps % log_interval == 0 or self.num_timesteps == total_timesteps):
                 self.dump_logs()
             callback.update_locals(locals())
@@ -155,6 +140,31 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         callback.on_training_end()
         parallel.close()
         return self
+
+    def _batches(self, buffer: TrajectoryBuffer, batch_size: int) -> Iterator[Windows]:
+        """Batches of the gradient steps from now on, each drawn by a seed of its own."""
+        assert self._training_seed is not None
+        seeds = (step_seed(self._training_seed, n_updates, BATCHES) for n_updates in itertools.count(self._n_updates))
+        return buffer.batches(
+            batch_size,
+            self.context_length,
+            th.Generator(self.device),
+            self.timestep_exponent,
+            n_ahead=self.policy.chunk_size - 1,
+            return_weight=self.return_weight,
+            seeds=seeds,
+        )
+
+    def _train_step(self, batches: Iterator[Windows], parallel: DataParallel) -> None:
+        """The next gradient step, which the number of those before it decides, and how long it took."""
+        assert self._training_seed is not None
+        start = time.perf_counter()
+        generator = th.Generator(self.device).manual_seed(step_seed(self._training_seed, self._n_updates, NOISE))
+        seed_default_generator(self.device, step_seed(self._training_seed, self._n_updates, DROPOUT, parallel.rank))
+        with self._memory_errors_named():
+            self._gradient_step(next(batches), generator, parallel)
+        self._training_seconds += time.perf_counter() - start
+        self._timed_steps += 1
 
     def _loss_function(self) -> LossFunction:
         """The policy's loss in the precision asked for, compiled where that pays."""
@@ -188,15 +198,19 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         critic, n_steps = self.policy.critic, self.policy.critic_steps
         if critic is None:
             return {}
-        assert self.buffer is not None
         assert self._training_seed is not None
         generator = th.Generator(self.device).manual_seed(step_seed(self._training_seed, self._n_updates, TRANSITIONS))
         sums: dict[str, th.Tensor] = {}
         for _ in range(n_steps):
-            batch = self.buffer.sample_transitions(critic.batch_size, self.policy.n_valued, self.policy.gamma, generator)
+            batch = self._sample_transitions(critic.batch_size, generator)
             parts = critic.learn(self.policy.normalization.scale_transitions(batch))
             sums = {name: sums.get(name, 0.0) + part for name, part in parts.items()}
         return {name: total / n_steps for name, total in sums.items()}
+
+    def _sample_transitions(self, batch_size: int, generator: th.Generator) -> Transitions:
+        """What the critic learns from."""
+        assert self.buffer is not None
+        return self.buffer.sample_transitions(batch_size, self.policy.n_valued, self.policy.gamma, generator)
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         remaining = self._current_progress_remaining

@@ -1,6 +1,7 @@
-"""Go on learning online: an algorithm of Stable-Baselines3 chooses the noise of a frozen DTFM."""
+"""Go on learning online: a DTFM from its own episodes, or an algorithm of Stable-Baselines3 by choosing its noise."""
 
 from sb3_dtfm.finetuning.noise_env import NoiseActionVecEnv, NoiseSpace
+from sb3_dtfm.finetuning.online import OnlineDTFM
 from sb3_dtfm.finetuning.steered import SteeredDTFM
 
-__all__ = ["NoiseActionVecEnv", "NoiseSpace", "SteeredDTFM"]
+__all__ = ["NoiseActionVecEnv", "NoiseSpace", "OnlineDTFM", "SteeredDTFM"]

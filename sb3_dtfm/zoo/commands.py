@@ -14,8 +14,9 @@ import rl_zoo3.utils
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3.utils import get_model_path
 
-from sb3_dtfm.zoo.finetuning import FinetuningManager
+from sb3_dtfm.zoo.finetuning import OnlineManager, SteeringManager
 from sb3_dtfm.zoo.manager import OfflineExperimentManager
+from sb3_dtfm.zoo.registration import ONLINE
 
 
 class FoundModel(NamedTuple):
@@ -46,16 +47,26 @@ def train(arguments: Sequence[str], resumed: Path | None = None) -> None:
     _call(rl_zoo3.train.train, "train", arguments)
 
 
-def finetune(arguments: Sequence[str], model: Path, target_return: float | None = None) -> None:
+def finetune(
+    arguments: Sequence[str],
+    model: Path,
+    target_return: float | None = None,
+    started_with: Sequence[str] = (),
+    resumed: Path | None = None,
+) -> None:
     """
-    Have an online algorithm steer a frozen DTFM, through :class:`FinetuningManager`.
+    Go on from a DTFM: by :class:`OnlineManager` where it learns itself, else by :class:`SteeringManager`.
 
     :param arguments: of RL-Zoo's `train`
     :param model: zip file of the DTFM, or folder of its run
     :param target_return: to ask for; None as in that run
+    :param started_with: the command's own arguments
+    :param resumed: folder of an interrupted run to go on with
     :raises TrainingError: training failed in its midst
+    :raises SystemExit: SIGTERM has ended it, after what there is was saved
     """
-    manager = functools.partial(FinetuningManager, base=model, target_return=target_return)
+    kind = OnlineManager if arguments[list(arguments).index("--algo") + 1] == ONLINE else SteeringManager
+    manager = functools.partial(kind, base=model, target_return=target_return, arguments=list(started_with), resumed=resumed)
     rl_zoo3.train.ExperimentManager = manager  # type: ignore[misc,assignment]
     _call(rl_zoo3.train.train, "finetune", arguments)
 

@@ -1,5 +1,6 @@
-"""RL-Zoo's experiment of an online algorithm that steers a frozen DTFM."""
+"""RL-Zoo's experiments that go on from a DTFM: an online algorithm steers it, or it learns from its own episodes."""
 
+import inspect
 import os
 import shutil
 from collections import OrderedDict
@@ -13,12 +14,14 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dtfm.algorithms import DTFM
+from sb3_dtfm.arguments import with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.files import read_run
-from sb3_dtfm.finetuning import NoiseActionVecEnv, SteeredDTFM
+from sb3_dtfm.finetuning import NoiseActionVecEnv, OnlineDTFM, SteeredDTFM
 from sb3_dtfm.zoo.arguments import UsageError
-from sb3_dtfm.zoo.manager import OfflineExperimentManager
+from sb3_dtfm.zoo.manager import OF_RL_ZOO, OfflineExperimentManager
 from sb3_dtfm.zoo.registration import STEERED
+from sb3_dtfm.zoo.resuming import EPISODES
 
 # The key of the settings of a NoiseActionVecEnv in a run's config.yml, where `enjoy` must not find a wrapper.
 NOISE_ENV = "noise_env"
@@ -87,13 +90,13 @@ def has_learned(agent: BaseAlgorithm) -> bool:
 
 class FinetuningManager(OfflineExperimentManager):
     """
-    RL-Zoo's own manager, for an online algorithm in a :class:`~sb3_dtfm.finetuning.NoiseActionVecEnv`.
-
-    What it evaluates and saves is the steered model, in the folder of a run of "steered"; beside it the algorithm itself.
+    RL-Zoo's own manager, for what goes on from a DTFM in the environment of that DTFM's run.
 
     :param base: file of the DTFM, or folder of its run
     :param target_return: to ask for; by default as in that run
     """
+
+    of_the_data: tuple[str, ...] = ()  # settings of that run that count here, too
 
     def __init__(self, *args: Any, base: Path, target_return: float | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -101,6 +104,33 @@ class FinetuningManager(OfflineExperimentManager):
         self.base_file = base / f"{self.env_name}.zip" if base.is_dir() else base
         if not self.base_file.is_file():
             raise FileNotFoundError(f"{self.base_file} does not exist; --model names a DTFM's zip file or its run's folder.")
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """RL-Zoo's; what the environment was to the DTFM comes from its run."""
+        hyperparams, _ = super().read_hyperparameters()
+        run = self.base_file.parent / self.env_name
+        known = read_run(run) if (run / "config.yml").is_file() else {}
+        from_the_run = ["env_wrapper", *([] if self.env_kwargs else ["env_kwargs"])]  # of the command line, if given there
+        from_the_run += self.of_the_data
+        hyperparams = {**{key: known[key] for key in from_the_run if known.get(key)}, **hyperparams}
+        if self._eval_env_kwargs_args is None:
+            self.eval_env_kwargs = hyperparams.get("env_kwargs") or self.env_kwargs
+        if self.target_return is not None:
+            hyperparams["env_wrapper"] = [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": self.target_return}}]
+        if not hyperparams.get("env_wrapper"):
+            raise UsageError(f"--target-return: needed, as {self.base} does not tell what return was asked for.")
+        return hyperparams, OrderedDict(sorted(hyperparams.items()))
+
+
+class SteeringManager(FinetuningManager):
+    """
+    An online algorithm learns in a :class:`~sb3_dtfm.finetuning.NoiseActionVecEnv`.
+
+    What is evaluated and saved is the steered model, in the folder of a run of "steered"; beside it the algorithm itself.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
         self.steered = SteeredDTFM.of(DTFM.load(self.base_file, device=self.device))
         name = Path(self.save_path).name.removeprefix(f"{self.env_name}_")
         uuid = name.lstrip("0123456789")
@@ -110,18 +140,8 @@ class FinetuningManager(OfflineExperimentManager):
         self.params_path = f"{self.save_path}/{self.env_name}"
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """RL-Zoo's; what the environment was to the frozen policy comes from its run."""
+        """Those of the online algorithm, and of the wrapper that it learns in."""
         hyperparams, _ = super().read_hyperparameters()
-        run = self.base_file.parent / self.env_name
-        known = read_run(run) if (run / "config.yml").is_file() else {}
-        from_the_run = ["env_wrapper", *([] if self.env_kwargs else ["env_kwargs"])]  # of the command line, if given there
-        hyperparams = {**{key: known[key] for key in from_the_run if known.get(key)}, **hyperparams}
-        if self._eval_env_kwargs_args is None:
-            self.eval_env_kwargs = hyperparams.get("env_kwargs") or self.env_kwargs
-        if self.target_return is not None:
-            hyperparams["env_wrapper"] = [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": self.target_return}}]
-        if not hyperparams.get("env_wrapper"):
-            raise UsageError(f"--target-return: needed, as {self.base} does not tell what return was asked for.")
         noise_env = self._noise_env(hyperparams)
         saved = {key: value for key, value in hyperparams.items() if key != "vec_env_wrapper"}
         saved[NOISE_ENV] = {**noise_env, "algorithm": self.algo, "model": str(self.base_file)}
@@ -192,3 +212,58 @@ class FinetuningManager(OfflineExperimentManager):
         model.save(os.path.join(self.save_path, AGENT))
         if self.save_replay_buffer and isinstance(model, OffPolicyAlgorithm):
             model.save_replay_buffer(os.path.join(self.save_path, "replay_buffer.pkl"))
+
+
+class OnlineManager(FinetuningManager):
+    """
+    The DTFM itself goes on learning, as an :class:`~sb3_dtfm.finetuning.OnlineDTFM`. What comes of it is a run of "dtfm".
+
+    The dataset is that of the DTFM's run. Own episodes are kept beside the model; who goes on from there takes them up.
+    """
+
+    command = "finetune"
+    of_the_data = ("dataset", "dataset_fraction", "dataset_seed", "dataset_kwargs")
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        if not self.continue_training:  # else the checkpoint of a run that is resumed
+            self.trained_agent, self.continue_training = str(self.base_file), True
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """
+        Those of online learning.
+
+        :raises UsageError: no dataset, or a name that it does not know
+        """
+        hyperparams, saved = super().read_hyperparameters()
+        known = {*inspect.signature(DTFM).parameters, *inspect.signature(OnlineDTFM).parameters, *OF_RL_ZOO}
+        unknown = sorted(set(hyperparams) - known)
+        if unknown:
+            raise UsageError(f"{with_nearest(unknown, sorted(known))}: no hyperparameter of finetune --algo dtfm.")
+        if not hyperparams.get("dataset"):
+            raise UsageError(f"-params dataset:...: needed, as {self.base} does not tell what it learned from.")
+        return hyperparams, saved
+
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        """RL-Zoo's, by this algorithm."""
+        settings = {key: value for key, value in hyperparams.items() if key not in ("policy", "policy_kwargs")}
+        about: dict[str, Any] = dict(
+            seed=self.seed, tensorboard_log=self.tensorboard_log, verbose=self.verbose, device=self.device
+        )
+        model = OnlineDTFM.load(self.trained_agent, env, **about, **settings)
+        own = Path(self.trained_agent).with_name(EPISODES)
+        if own.is_file():
+            model.load_replay_buffer(own)
+        return model
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        """
+        RL-Zoo's, and the own episodes.
+
+        :param model: trained
+        :raises SystemExit: SIGTERM has ended the run
+        """
+        assert isinstance(model, OnlineDTFM)
+        if model.own is not None:
+            model.save_replay_buffer(os.path.join(self.save_path, EPISODES))
+        super().save_trained_model(model)

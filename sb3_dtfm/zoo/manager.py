@@ -40,19 +40,21 @@ class OfflineExperimentManager(ExperimentManager):
     - Of the processes of one training, the first alone runs callbacks.
     - They keep a checkpoint while they train, and a run goes on from it.
 
-    :param arguments: what RL-Zoo's `train` was called with
+    :param arguments: what the command was called with
     :param resumed: folder of a run to go on with, instead of a new one
     """
+
+    command = "train"
 
     def __init__(self, *args: Any, arguments: Sequence[str] = (), resumed: Path | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.signals = StopSignals(between_steps=self.algo in ALGORITHMS)
         self.keeper: KeepCheckpoint | None = None
         # RL-Zoo draws a seed where none is given; the last one that is given counts.
-        self.start = Start([*arguments, "--seed", str(self.seed)])
+        self.start = Start([*arguments, "--seed", str(self.seed)], command=self.command)
         self.resumed = resumed
         if resumed is not None:
-            self.start = self.start._replace(tensorboard=Start.read(resumed).tensorboard)
+            self.start = self.start._replace(tensorboard=Start.read(resumed, self.command).tensorboard)
             if is_first_process():  # what others write is not kept
                 self.save_path, self.params_path = str(resumed), str(resumed / self.env_name)
             self.trained_agent = str(resumed / CHECKPOINT)
@@ -130,6 +132,8 @@ class OfflineExperimentManager(ExperimentManager):
         elif self.keeper is not None:
             if self.signals.asked and not self.signals.at_once:  # else in the midst of a step
                 self.keeper.save()
-            print(f"Interrupted after {model.num_timesteps} steps; sb3-dtfm train --resume {self.save_path} goes on.")
+            print(
+                f"Interrupted after {model.num_timesteps} steps; sb3-dtfm {self.command} --resume {self.save_path} goes on."
+            )
         if self.signals.terminated and not ended:
             raise SystemExit(128 + signal.SIGTERM)

@@ -16,6 +16,8 @@ from sb3_dtfm.policies import SequencePolicy
 
 # What RL-Zoo calls a DTFM that an online algorithm steers: a folder of the logs, and `enjoy --algo`.
 STEERED = "steered"
+# What `finetune --algo` calls a DTFM that goes on by itself; its run is one of this algorithm, as any other.
+ONLINE = "dtfm"
 # Where settings of the online algorithms are.
 FINETUNING_CONFIGS = "sb3_dtfm.zoo_configs.finetune"
 # What `--conf-file` accepts besides files and Python packages; None is no `--conf-file` at all.

@@ -19,10 +19,13 @@ from torch.utils.tensorboard import SummaryWriter
 
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd
 from sb3_dtfm.files import replacing
+from sb3_dtfm.finetuning import OnlineDTFM
 from sb3_dtfm.zoo.arguments import UsageError
 
 # In a run's folder while it is unfinished: the model as it was, and how the run was started.
 CHECKPOINT, START = "checkpoint.zip", "start.json"
+# Beside a model that learns online: its own episodes.
+EPISODES = "episodes.npz"
 CHECKPOINT_INTERVAL = 60.0  # seconds of training that a killed run loses at most
 STOPPING = b"\nStopping after this gradient step, or the evaluation that runs; once more stops at once.\n"
 
@@ -31,12 +34,14 @@ class Start(NamedTuple):
     """
     How a run was started.
 
-    :param arguments: of RL-Zoo's `train`
+    :param arguments: of RL-Zoo's `train`, or those of the command
     :param tensorboard: folder of its curves, None for none
+    :param command: "train" or "finetune"
     """
 
     arguments: list[str]
     tensorboard: str | None = None
+    command: str = "train"
 
     def write(self, run: Path) -> None:
         """
@@ -46,21 +51,26 @@ class Start(NamedTuple):
             path.write_text(json.dumps(self._asdict(), indent=1))
 
     @classmethod
-    def read(cls, run: Path) -> "Start":
+    def read(cls, run: Path, command: str = "train") -> "Start":
         """
         :param run: the run's folder
-        :raises UsageError: no run of this package's `train`, or one that is finished
+        :param command: that is to go on with it
+        :raises UsageError: no run of this package's, or of another command, or one that is finished
         """
         if not run.is_dir():
             raise UsageError(f"--resume {run}: no such folder; expected that of a run, as logs/dtfm/HalfCheetah-v5_1.")
         if not (run / START).is_file():
             raise UsageError(
-                f"--resume {run}: nothing to go on with; the run is finished, or `sb3-dtfm train` did not start it."
+                f"--resume {run}: nothing to go on with; the run is finished, or `sb3-dtfm {command}` did not start it."
             )
         try:
             start = cls(**json.loads((run / START).read_text()))
         except (ValueError, TypeError) as error:
             raise UsageError(f"--resume {run}: {START} is damaged: {error}.") from error
+        if start.command != command:
+            raise UsageError(
+                f"--resume {run}: `sb3-dtfm {start.command}` started it; sb3-dtfm {start.command} --resume goes on."
+            )
         return start
 
 
@@ -135,7 +145,9 @@ class KeepCheckpoint(BaseCallback):
         self.ended = True
 
     def save(self) -> None:
-        """Save the model as it is."""
+        """Save the model as it is, and its own episodes if it has any."""
+        if isinstance(self.model, OnlineDTFM) and self.model.own is not None:
+            self.model.save_replay_buffer(self.path.with_name(EPISODES))
         self.model.save(self.path)
         self._saved_at = time.monotonic()
 
@@ -195,7 +207,7 @@ def go_on(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], start: Start)
     """
     n_steps = model.num_timesteps
     for callback in callbacks if n_steps else ():
-        callback.n_calls = n_steps  # one a gradient step
+        callback.n_calls = n_steps // (model.n_envs if isinstance(model, OnlineDTFM) else 1)
         if isinstance(callback, EvaluateAtStartAndEnd):
             callback.go_on(n_steps)
         elif isinstance(callback, EvalCallback) and callback.log_path is not None:

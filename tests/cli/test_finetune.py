@@ -1,12 +1,16 @@
 """`sb3-dtfm finetune`: from a run of `train` to a steered model that `enjoy` plays."""
 
+import signal
+
 import numpy as np
 import pytest
 import yaml
 from stable_baselines3 import PPO, SAC
 
+from sb3_dtfm import DTFM
 from sb3_dtfm.cli.main import main
-from sb3_dtfm.finetuning import SteeredDTFM
+from sb3_dtfm.data import load_dataset
+from sb3_dtfm.finetuning import OnlineDTFM, SteeredDTFM
 from tests.recorded import DATASET_ID, tiny_training
 
 EVALUATIONS = ["--eval-freq", "10", "--eval-episodes", "2"]
@@ -72,6 +76,59 @@ def test_ppo_and_a_zip_file_with_a_target_of_its_own(run, workplace):
     np.testing.assert_array_equal(agent.policy.action_net.weight.detach(), model.policy.steering.mean.weight)
 
 
+def test_a_dtfm_goes_on_from_its_own_episodes(run, workplace, capsys):
+    """And once more from there; each is a run of dtfm, as the first one, and its own episodes are taken along."""
+    settings = ["--algo", "dtfm", "-tb", "tb", "-params", "n_episodes:2", "gradient_steps:2", "n_envs:2", "batch_size:4"]
+    for number, n_before in ((2, 0), (3, 4)):
+        source = workplace / f"logs/dtfm/HalfCheetah-v5_{number - 1}"
+        command = ["finetune", "--env", "HalfCheetah-v5", "--model", str(source), "-n", "80", "--seed", "1", *settings]
+        assert main([*command, "--eval-freq", "40", "--eval-episodes", "2"]) == 0
+        online = workplace / f"logs/dtfm/HalfCheetah-v5_{number}"
+        evaluations = np.load(online / "evaluations.npz")
+        assert evaluations["timesteps"].tolist() == [0, 40, 80]
+        assert evaluations["ep_lengths"].max() == 20, "of the run's own environment"
+        own = load_dataset(online / "episodes.npz")
+        assert own.episode_lengths.tolist() == [20] * (n_before + 4)
+        model = DTFM.load(online / "HalfCheetah-v5")
+        assert model.num_timesteps == 80
+        assert not (online / "checkpoint.zip").exists()
+    before = DTFM.load(run / "HalfCheetah-v5")
+    assert any(
+        (ours != theirs).any() for ours, theirs in zip(model.policy.parameters(), before.policy.parameters(), strict=True)
+    )
+    assert main(["enjoy", "--algo", "dtfm", "--env", "HalfCheetah-v5", "--no-render", "-n", "45", "--load-best"]) == 0
+    assert "Episode Length 20" in capsys.readouterr().out
+
+
+def test_online_learning_that_was_interrupted_goes_on(run, workplace, capsys, monkeypatch):
+    settings = ["--algo", "dtfm", "-params", "n_episodes:2", "gradient_steps:2", "n_envs:2", "batch_size:4"]
+    command = ["finetune", "--env", "HalfCheetah-v5", "--model", str(run), "-n", "160", "--seed", "1", *settings]
+    steps_of_both = OnlineDTFM._collect
+
+    def interrupted(self, callback):
+        if self.num_timesteps >= 80:
+            signal.raise_signal(signal.SIGTERM)
+        return steps_of_both(self, callback)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(OnlineDTFM, "_collect", interrupted)
+        with pytest.raises(SystemExit, match="143"):
+            main([*command, "--eval-freq", "40", "--eval-episodes", "2"])
+    online = workplace / "logs/dtfm/HalfCheetah-v5_2"
+    assert f"sb3-dtfm finetune --resume {online.relative_to(workplace)} goes on." in capsys.readouterr().out
+    n_before = load_dataset(online / "episodes.npz").n_episodes
+    assert n_before == 4
+    assert main(["train", "--resume", str(online)]) == 2
+    assert "`sb3-dtfm finetune` started it" in capsys.readouterr().err
+    assert main(["finetune", "--resume", str(online), "-n", "3"]) == 2
+    assert "takes no other arguments" in capsys.readouterr().err
+    assert main(["finetune", "--resume", str(online)]) == 0
+    assert np.load(online / "evaluations.npz")["timesteps"].tolist()[:5] == [0, 40, 80, 120, 160]
+    assert load_dataset(online / "episodes.npz").n_episodes > n_before
+    assert DTFM.load(online / "HalfCheetah-v5").num_timesteps >= 160
+    assert not (online / "checkpoint.zip").exists()
+
+
 @pytest.mark.slow
 def test_the_online_algorithm_goes_on_learning(run, workplace):
     arguments = ["--model", str(run), "--save-replay-buffer", "-params", *QUICK]
@@ -90,7 +147,10 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
         "--model nowhere": "nowhere does not exist; --model names a DTFM's zip file or its run's folder.",
         "--model logs/dt/HalfCheetah-v5_1": "was saved by DT, not by DTFM.",
         "--model alone.zip": "--target-return: needed, as alone.zip does not tell what return was asked for.",
-        f"--model {run} --algo td3": "--algo td3: no packaged settings; those of ppo, sac, tqc are.",
+        f"--model {run} --algo td3": "--algo td3: no packaged settings; those of dtfm, ppo, sac, tqc are.",
+        "--model alone.zip --algo dtfm --target-return 3": "dataset:...: needed, as alone.zip does not tell what it learned",
+        f"--model {run} --algo dtfm -params n_episods:3": "n_episods (did you mean n_episodes?): no hyperparameter of",
+        "--resume logs/dtfm/HalfCheetah-v5_1 --seed 3": "takes no other arguments",
         f"--model {run} -params {wrong}": "expected sb3_dtfm.finetuning.NoiseActionVecEnv alone.",
         f"--model {run} -params use_sde:True": "its exploration depends on the state (use_sde)",
         f"--model {run} -optimize": "-optimize: hyperparameters of finetune cannot be searched",

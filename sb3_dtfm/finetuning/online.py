@@ -1,0 +1,236 @@
+"""A DTFM that goes on learning from episodes of its own."""
+
+from collections.abc import Iterator
+from os import PathLike
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.utils import safe_mean
+
+from sb3_dtfm.algorithms import DTFM
+from sb3_dtfm.arguments import COUNT, Number, Rule, check_arguments
+from sb3_dtfm.data import Trajectory, TrajectoryBuffer, load_dataset
+from sb3_dtfm.distributed import DataParallel
+from sb3_dtfm.envs import OBSERVATION, return_to_go_space
+from sb3_dtfm.envs.success import reported_success
+from sb3_dtfm.windows import Transitions, Windows
+
+SelfOnlineDTFM = TypeVar("SelfOnlineDTFM", bound="OnlineDTFM")
+
+ACCEPTED: dict[str, Rule] = {
+    "n_episodes": COUNT,
+    "gradient_steps": COUNT,
+    "own_share": Number(low=0, high=1, above_low=True),
+}
+
+
+class Step(NamedTuple):
+    """
+    A step of all environments.
+
+    :param observations: (B, O), as the environments gave them
+    :param actions: (B, A) in their range, or (B,) of choices
+    :param rewards: (B,)
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+
+
+class OnlineDTFM(DTFM):
+    """
+    A DTFM that goes on imitating: its dataset, and those of its own episodes that succeeded.
+
+    It acts from fresh noise, so that no two attempts are alike; what worked is imitated, and works more often from then on.
+    Where the environment tells of no success, an episode is imitated that returned at least as much as the average of
+    dataset and own episodes so far. With a critic (`critic_steps` among the `policy_kwargs`) all episodes teach the critic,
+    failures too, and the critic chooses among `n_candidates` draws.
+
+    `learn(total_timesteps)` counts the environments' steps, as online algorithms do. What it becomes is a DTFM, and saved as
+    one: `OnlineDTFM.load("can.zip", env, dataset="can.hdf5")` goes on from a DTFM, and `DTFM.load` reads what it saves.
+
+    :param n_episodes: own episodes between two times of learning, of all environments together
+    :param gradient_steps: each of these times
+    :param own_share: share of a batch that is from own episodes, once one is worth it; the rest is from the dataset
+    :ivar own: all own episodes, None before the first ones
+    """
+
+    def __init__(
+        self, *args: Any, n_episodes: int = 10, gradient_steps: int = 100, own_share: float = 0.5, **kwargs: Any
+    ) -> None:
+        self.n_episodes = n_episodes
+        self.gradient_steps = gradient_steps
+        self.own_share = own_share
+        self.own: TrajectoryBuffer | None = None
+        self._running: list[Step] = []  # of the episodes that have not ended
+        self._began: list[int] = []  # where each environment's episode begins in them
+        self._state: tuple[np.ndarray, ...] | None = None  # of acting
+        super().__init__(*args, **kwargs)
+
+    def _check_arguments(self, learning_rate: Rule) -> None:
+        super()._check_arguments(learning_rate)
+        vars(self).update(check_arguments(vars(self), ACCEPTED))
+
+    def _excluded_save_params(self) -> list[str]:
+        """Also what a DTFM, whose file it is saved as, does not have."""
+        return [*super()._excluded_save_params(), *ACCEPTED, "own", "_running", "_began", "_state"]
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        """SB3's own, for the environments count here."""
+        before = self._last_obs
+        self._training_seconds, self._timed_steps = 0.0, 0
+        total_timesteps, callback = BaseAlgorithm._setup_learn(self, *args, **kwargs)
+        if self._last_obs is not before:  # they have been reset
+            self._running, self._began, self._state = [], [0] * self.n_envs, None
+        return total_timesteps, callback
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        return BaseAlgorithm._init_callback(self, callback, progress_bar)
+
+    def learn(
+        self: SelfOnlineDTFM,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 1,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfOnlineDTFM:
+        """
+        Act and learn in turns; callbacks run once after each step of the environments.
+
+        :param total_timesteps: steps of all environments together
+        :param callback: SB3 callback or list of callbacks
+        :param log_interval: times of learning between two logs, None for none
+        :param tb_log_name: name of the run in TensorBoard, the algorithm's by default
+        :param reset_num_timesteps: count from zero, otherwise go on counting
+        :param progress_bar: show one
+        :return: the model
+        :raises ValueError: no dataset, no environment, or an argument out of range
+        :raises FloatingPointError: the loss or its gradient is no longer finite; such a step changes no weight
+        """
+        if self.env is None:
+            raise ValueError("OnlineDTFM has no environment to act in: load(path, env, dataset=...) or set_env().")
+        if self.buffer is None:
+            self._load_buffer()
+        total_timesteps, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
+        )
+        parallel = DataParallel(self.policy, self._loss_function(), self.batch_size)
+        self._training_seed = self._choose_training_seed()
+        callback.on_training_start(locals(), globals())
+        n_learned = 0
+        while self.num_timesteps < total_timesteps and self._collect(callback):
+            self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
+            batches = self._imitated()
+            for _ in range(self.gradient_steps):
+                self._train_step(batches, parallel)
+            n_learned += 1
+            if log_interval and n_learned % log_interval == 0:
+                self.dump_logs()
+        callback.on_training_end()
+        return self
+
+    def _collect(self, callback: BaseCallback) -> bool:
+        """
+        Act until `n_episodes` have ended; those that run then go on the next time.
+
+        :return: False where a callback ends the training
+        """
+        assert self.env is not None
+        ended: list[Trajectory] = []
+        callback.on_rollout_start()
+        while len(ended) < self.n_episodes:
+            observations: Any = self._last_obs
+            actions, self._state = self.policy.predict(observations, self._state, self._last_episode_starts)
+            self._last_obs, rewards, dones, infos = self.env.step(actions)  # type: ignore[assignment]
+            self._last_episode_starts = dones
+            self._running.append(Step(observations[OBSERVATION], actions, rewards))
+            self._update_info_buffer(infos, dones)
+            ended += [self._take(row, infos[row]) for row in np.flatnonzero(dones)]
+            self.num_timesteps += self.n_envs
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+        callback.on_rollout_end()
+        n_past = min(self._began)
+        self._running, self._began = self._running[n_past:], [began - n_past for began in self._began]
+        self._keep(ended)
+        return True
+
+    def _take(self, row: int, info: dict[str, Any]) -> Trajectory:
+        """The episode that an environment has just ended."""
+        steps = self._running[self._began[row] :]
+        self._began[row] = len(self._running)
+        truncated = bool(info.get("TimeLimit.truncated", False))
+        own = Step(*(np.stack([array[row] for array in column]) for column in zip(*steps, strict=True)))
+        success = reported_success(info)
+        return Trajectory(**own._asdict(), terminated=not truncated, truncated=truncated, success=success)
+
+    def _keep(self, episodes: list[Trajectory]) -> None:
+        """Put own episodes behind the earlier ones."""
+        assert self.buffer is not None
+        known = (self.action_space, self.buffer.observation_space)
+        new = TrajectoryBuffer.from_trajectories(episodes, *known, source="own episodes", env_id=self.buffer.env_id)
+        new = new if self.own is None else TrajectoryBuffer.join([self.own, new], [1.0, 1.0])
+        self.own = new.to(self.device)
+
+    def save_replay_buffer(self, path: str | PathLike[str]) -> None:
+        """
+        Write the own episodes as flat arrays, which `dataset=` takes, too.
+
+        :param path: of the file; `.npz` is added where it is missing
+        :raises ValueError: there are none yet
+        :raises OSError: it cannot be written
+        """
+        if self.own is None:
+            raise ValueError("There are no own episodes to save yet.")
+        self.own.save(path)
+
+    def load_replay_buffer(self, path: str | PathLike[str]) -> None:
+        """
+        Take up own episodes of an earlier run.
+
+        :param path: what :meth:`save_replay_buffer` wrote
+        :raises DatasetError: it cannot be read, or does not fit the model
+        """
+        own = load_dataset(path, action_space=self.action_space)
+        self._check_spaces(return_to_go_space(own.observation_space), own.action_space, f"{path} holds", "the model's are")
+        self.own = own.to(self.device)
+
+    def _imitated(self) -> Iterator[Windows]:
+        """Batches of the dataset and of the own episodes that are worth it."""
+        assert self.buffer is not None
+        assert self.own is not None
+        average = np.concatenate([self.buffer.episode_returns, self.own.episode_returns]).mean()
+        successes, returns = self.own.successes, self.own.episode_returns
+        worthy = np.flatnonzero(np.where(np.isnan(successes), returns >= average, successes == 1.0))
+        n_own = round(self.own_share * self.batch_size) if len(worthy) else 0
+        parts = [(self.buffer, self.batch_size - n_own), *([(self.own.select(worthy), n_own)] if n_own else [])]
+        streams = [self._batches(buffer, size) for buffer, size in parts if size]
+        return (Windows(*map(th.cat, zip(*batches, strict=True))) for batches in zip(*streams, strict=True))
+
+    def _sample_transitions(self, batch_size: int, generator: th.Generator) -> Transitions:
+        """Of all episodes, so many own ones as are imitated."""
+        if self.own is None:
+            return super()._sample_transitions(batch_size, generator)
+        n_own = round(self.own_share * batch_size)
+        own = self.own.sample_transitions(n_own, self.policy.n_valued, self.policy.gamma, generator)
+        if n_own == batch_size:
+            return own
+        others = super()._sample_transitions(batch_size - n_own, generator)
+        return Transitions(*map(th.cat, zip(others, own, strict=True)))
+
+    def dump_logs(self) -> None:
+        """Log what SB3's online algorithms do, and the means since the last call."""
+        if self.ep_info_buffer:
+            self.logger.record("rollout/ep_rew_mean", safe_mean([each["r"] for each in self.ep_info_buffer]))
+            self.logger.record("rollout/ep_len_mean", safe_mean([each["l"] for each in self.ep_info_buffer]))
+        if self.ep_success_buffer:
+            self.logger.record("rollout/success_rate", safe_mean(self.ep_success_buffer))
+        super().dump_logs()

@@ -1,0 +1,175 @@
+"""A DTFM that goes on learning from episodes of its own."""
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from sb3_dtfm import DTFM
+from sb3_dtfm.data import DatasetError, Trajectory, TrajectoryBuffer
+from sb3_dtfm.envs import OBSERVATION, ReturnToGoWrapper
+from sb3_dtfm.finetuning import OnlineDTFM
+from tests.algorithms.small import make_model, record_curves
+from tests.finetuning.test_learning import Sides, small_flow_of_two_sides
+from tests.finetuning.test_noise_env import CHUNKS, make_venv
+
+ONLINE = dict(n_episodes=4, gradient_steps=2, seed=5, device="cpu")
+
+
+@pytest.fixture
+def file(cheetah_buffer, tmp_path):
+    model = make_model(DTFM, cheetah_buffer, ema_decay=0.9, policy_kwargs=CHUNKS).learn(5)
+    model.save(tmp_path / "offline.zip")
+    return tmp_path / "offline.zip"
+
+
+@pytest.fixture
+def model(file, cheetah_buffer):
+    return OnlineDTFM.load(file, make_venv(), dataset=cheetah_buffer, **ONLINE)
+
+
+class Watch(BaseCallback):
+    """Keeps what each environment's steps were, environment by environment, and may end the training."""
+
+    def __init__(self, n_steps: float = np.inf) -> None:
+        super().__init__()
+        self.ended: list[list] = []
+        self.n_steps = n_steps
+
+    def _on_training_start(self) -> None:
+        self.running = [[] for _ in range(self.training_env.num_envs)]
+
+    def _on_step(self) -> bool:
+        now = self.locals
+        for row, steps in enumerate(self.running):
+            steps.append([now["observations"][OBSERVATION][row], now["actions"][row], now["rewards"][row]])
+            if now["dones"][row]:
+                self.ended.append(self.running[row])
+                self.running[row] = []
+        return self.n_calls < self.n_steps
+
+
+def test_own_episodes_are_kept_as_they_were(model):
+    """Episodes of 7, 10 and 4 steps in environments of their own, of which the second one ends for good."""
+    watch = Watch()
+    model.learn(90, watch)
+    assert model.num_timesteps % 3 == 0
+    assert 90 <= model.num_timesteps < 90 + 3 * 10
+    own = model.own
+    assert own.episode_lengths[:4].tolist() == [4, 7, 4, 10]
+    assert own.terminated.tolist() == [length == 10 for length in own.episode_lengths]
+    assert own.truncated.tolist() == [length != 10 for length in own.episode_lengths]
+    assert (own.successes == 1.0).all()
+    expected = [np.array(column) for column in zip(*(step for steps in watch.ended for step in steps), strict=True)]
+    assert [len(steps) for steps in watch.ended][: own.n_episodes] == own.episode_lengths.tolist()
+    for array, column in zip((own.observations, own.actions, own.rewards), expected, strict=True):
+        np.testing.assert_allclose(array, column[: len(own)], rtol=1e-6)
+
+
+def test_learning_repeats_and_is_logged_and_a_callback_ends_it(file, cheetah_buffer):
+    models = [OnlineDTFM.load(file, make_venv(), dataset=cheetah_buffer, **ONLINE) for _ in range(2)]
+    curves = record_curves(models[0])
+    for each in models:
+        each.learn(60)
+    for ours, theirs in zip(models[0].policy.parameters(), models[1].policy.parameters(), strict=True):
+        th.testing.assert_close(ours, theirs, rtol=0, atol=0)
+    assert models[0]._n_updates > 5
+    assert {"rollout/ep_rew_mean", "rollout/ep_len_mean", "rollout/success_rate", "train/loss"} <= curves.points.keys()
+    assert models[0].learn(60, Watch(n_steps=3)).num_timesteps == 9
+
+
+def episodes(returns, successes):
+    """Own episodes of three steps whose observations tell which one they are of."""
+    return TrajectoryBuffer.from_trajectories(
+        [
+            Trajectory(np.full((3, 17), 100.0 + i), np.zeros((3, 6)), np.array([0.0, 0.0, value]), True, success=success)
+            for i, (value, success) in enumerate(zip(returns, successes, strict=True))
+        ],
+        make_venv().action_space,
+    )
+
+
+@pytest.mark.parametrize(
+    ("successes", "worthy"), [([True, False, None, None], {0, 3}), ([False] * 4, set())], ids=["some", "none"]
+)
+def test_so_many_steps_are_of_own_episodes_that_succeeded(model, cheetah_buffer, successes, worthy):
+    """Where nobody tells of success, an episode counts that is above the average: of the last two the second one."""
+    model.set_dataset(cheetah_buffer)
+    model.own_share, model._training_seed = 0.25, 0
+    model.own = episodes([-1e3, 1e3, -1e3, 1e3], successes)
+    _, *batches = zip(range(20), model._imitated(), strict=False)
+    present = {round(float(each) - 100) for _, batch in batches for each in batch.observations[:, -1, 0] if each > 50}
+    n_own = {int((batch.observations[:, -1, 0] > 50).sum()) for _, batch in batches}
+    assert present == worthy
+    assert n_own == ({4} if worthy else {0})
+    assert {len(batch.mask) for _, batch in batches} == {16}
+
+
+def test_what_it_saves_is_a_dtfm(model, tmp_path, cheetah_buffer):
+    model.learn(40).save(tmp_path / "online.zip")
+    observations = make_venv().reset()
+    expected, _ = model.predict(observations, deterministic=True, episode_start=np.ones(3, bool))
+    for cls in (DTFM, OnlineDTFM):
+        loaded = cls.load(tmp_path / "online.zip", device="cpu")
+        actions, _ = loaded.predict(observations, deterministic=True, episode_start=np.ones(3, bool))
+        np.testing.assert_array_equal(actions, expected)
+    assert OnlineDTFM.load(tmp_path / "online.zip", make_venv(), dataset=cheetah_buffer, **ONLINE).learn(30).own is not None
+
+
+def test_own_episodes_are_saved_and_taken_up(model, tmp_path):
+    with pytest.raises(ValueError, match="no own episodes"):
+        model.save_replay_buffer(tmp_path / "own.npz")
+    model.learn(60).save_replay_buffer(tmp_path / "own.npz")
+    before, model.own = model.own, None
+    model.load_replay_buffer(tmp_path / "own.npz")
+    for name in ("observations", "actions", "rewards", "returns_to_go"):
+        th.testing.assert_close(getattr(model.own, name), getattr(before, name), rtol=0, atol=0)
+    np.testing.assert_array_equal(model.own.successes, before.successes)
+    np.testing.assert_array_equal(model.own.terminated, before.terminated)
+    buffer = TrajectoryBuffer.from_trajectories(
+        [Trajectory(np.zeros((2, 3)), np.zeros((2, 6)), np.zeros(2))], model.action_space
+    )
+    buffer.save(tmp_path / "other.npz")
+    with pytest.raises(DatasetError, match=r"other\.npz holds observations of"):
+        model.load_replay_buffer(tmp_path / "other.npz")
+
+
+def test_a_critic_learns_of_all_episodes(cheetah_buffer, tmp_path):
+    policy_kwargs = dict(CHUNKS, critic_steps=2, n_candidates=4)
+    make_model(DTFM, cheetah_buffer, policy_kwargs=policy_kwargs).learn(2).save(tmp_path / "guided.zip")
+    model = OnlineDTFM.load(tmp_path / "guided.zip", make_venv(), dataset=cheetah_buffer, **ONLINE)
+    model.set_dataset(cheetah_buffer)
+    model.own = episodes([-1e3] * 4, [False] * 4)
+    generator = th.Generator().manual_seed(0)
+    batch = model._sample_transitions(64, generator)
+    assert int((batch.observations[:, 0] > 50).sum()) == 32
+    assert len(batch.mask) == 64
+    before = model.policy.critic.value[0].weight.clone()
+    model.learn(40)
+    assert (model.policy.critic.value[0].weight != before).any()
+
+
+def test_what_it_cannot_learn_with_is_refused(file, cheetah_buffer):
+    with pytest.raises(ValueError, match="no environment to act in"):
+        OnlineDTFM.load(file, dataset=cheetah_buffer).learn(10)
+    with pytest.raises(ValueError, match="no dataset to learn from"):
+        OnlineDTFM.load(file, make_venv()).learn(10)
+    for name, wrong in {"n_episodes": 0, "gradient_steps": 1.5, "own_share": 0.0}.items():
+        with pytest.raises(ValueError, match=name):
+            OnlineDTFM.load(file, make_venv(), dataset=cheetah_buffer, **{name: wrong})
+
+
+@pytest.mark.slow
+def test_what_is_rewarded_is_done_more_often(tmp_path):
+    offline, demonstrations = small_flow_of_two_sides()
+    offline.save(tmp_path / "offline.zip")
+    make = dict(wrapper_class=ReturnToGoWrapper, wrapper_kwargs=dict(target_return=1.0))
+    venv, evaluated = (make_vec_env(Sides, 4, seed=seed, **make) for seed in (0, 1))
+    settings = dict(n_episodes=50, gradient_steps=50, learning_rate_schedule="constant", seed=0, device="cpu")
+    model = OnlineDTFM.load(tmp_path / "offline.zip", venv, dataset=demonstrations, **settings).learn(1500)
+    before, _ = evaluate_policy(offline, evaluated, n_eval_episodes=100)
+    after, _ = evaluate_policy(model, evaluated, n_eval_episodes=100)
+    assert before < 0.7
+    assert after > before + 0.2
