@@ -5,8 +5,8 @@ What fine-tuning brought: runs of `sb3-dtfm finetune` as rows, a table and curve
         --output results/finetuning/can-few_seed0.json
     python studies/finetuning.py report results/finetuning --figure docs/studies/finetuning.png
 
-`measure` plays 100 episodes from initial states of their own with the model before and after, the last one and not the best, and
-takes the curve from the run's evaluations.npz and its monitors.
+`measure` plays 100 episodes, from initial states of their own, with the model before and with the one after (the last one, not
+the best), and takes the curve from the run's evaluations.npz and its monitors.
 """
 
 import argparse
