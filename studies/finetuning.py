@@ -5,8 +5,8 @@ What fine-tuning brought: runs of `sb3-dtfm finetune` as rows, a table and curve
         --output results/finetuning/can-few_seed0.json
     python studies/finetuning.py report results/finetuning --figure docs/studies/finetuning.png
 
-`measure` plays 100 episodes, from initial states of their own, with the model before and with the one after (the last one, not
-the best), and takes the curve from the run's evaluations.npz and its monitors.
+`measure` plays 100 episodes, from initial states of their own, with the model before and with the last one
+after. The curve is from the run's evaluations.npz, minutes and steps from its monitors.
 """
 
 import argparse
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch as th
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from tqdm import tqdm
@@ -61,7 +62,7 @@ def measure(run: Path, before: Path) -> dict[str, Any]:
         "own": own_episodes(run),
         "commit": commit(),
         "versions": versions(),
-        "hardware": hardware("cpu"),
+        "hardware": hardware(th.device("cpu")),
     }
 
 
