@@ -1,5 +1,6 @@
 """A DTFM that goes on learning from episodes of its own."""
 
+import time
 from collections.abc import Iterator
 from os import PathLike
 from typing import Any, NamedTuple, TypeVar
@@ -10,11 +11,12 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import safe_mean
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dtfm.algorithms import DTFM
 from sb3_dtfm.arguments import COUNT, Number, Rule, check_arguments
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer, load_dataset
-from sb3_dtfm.distributed import DataParallel
+from sb3_dtfm.distributed import DataParallel, n_processes
 from sb3_dtfm.envs import OBSERVATION, return_to_go_space
 from sb3_dtfm.envs.success import reported_success
 from sb3_dtfm.windows import Transitions, Windows
@@ -116,6 +118,7 @@ class OnlineDTFM(DTFM):
         """
         if self.env is None:
             raise ValueError("OnlineDTFM has no environment to act in: load(path, env, dataset=...) or set_env().")
+        self._check_online(self.env)
         if self.buffer is None:
             self._load_buffer()
         total_timesteps, callback = self._setup_learn(
@@ -136,6 +139,21 @@ class OnlineDTFM(DTFM):
         callback.on_training_end()
         return self
 
+    @staticmethod
+    def _check_online(env: VecEnv) -> None:
+        """
+        :raises ValueError: several processes, or rewards that are not the environment's
+        """
+        if n_processes() > 1:
+            raise ValueError(
+                f"OnlineDTFM learns in one process, not in {n_processes()}; its environments may have their own."
+            )
+        vec_normalize = unwrap_vec_normalize(env)
+        if vec_normalize is not None and vec_normalize.norm_reward:
+            raise ValueError(
+                "VecNormalize(norm_reward=True) would change the returns of own episodes; use norm_reward=False."
+            )
+
     def _collect(self, callback: BaseCallback) -> bool:
         """
         Act until `n_episodes` have ended; those that run then go on the next time.
@@ -144,8 +162,9 @@ class OnlineDTFM(DTFM):
         """
         assert self.env is not None
         ended: list[Trajectory] = []
+        goes_on = True
         callback.on_rollout_start()
-        while len(ended) < self.n_episodes:
+        while goes_on and len(ended) < self.n_episodes:
             observations: Any = self._last_obs
             actions, self._state = self.policy.predict(observations, self._state, self._last_episode_starts)
             self._last_obs, rewards, dones, infos = self.env.step(actions)  # type: ignore[assignment]
@@ -155,13 +174,13 @@ class OnlineDTFM(DTFM):
             ended += [self._take(row, infos[row]) for row in np.flatnonzero(dones)]
             self.num_timesteps += self.n_envs
             callback.update_locals(locals())
-            if not callback.on_step():
-                return False
+            goes_on = callback.on_step()
         callback.on_rollout_end()
         n_past = min(self._began)
         self._running, self._began = self._running[n_past:], [began - n_past for began in self._began]
-        self._keep(ended)
-        return True
+        if ended:
+            self._keep(ended)
+        return goes_on
 
     def _take(self, row: int, info: dict[str, Any]) -> Trajectory:
         """The episode that an environment has just ended."""
@@ -228,6 +247,8 @@ class OnlineDTFM(DTFM):
 
     def dump_logs(self) -> None:
         """Log what SB3's online algorithms do, and the means since the last call."""
+        seconds = max((time.time_ns() - self.start_time) / 1e9, 1e-9)
+        self.logger.record("time/fps", int((self.num_timesteps - self._num_timesteps_at_start) / seconds))
         if self.ep_info_buffer:
             self.logger.record("rollout/ep_rew_mean", safe_mean([each["r"] for each in self.ep_info_buffer]))
             self.logger.record("rollout/ep_len_mean", safe_mean([each["l"] for each in self.ep_info_buffer]))

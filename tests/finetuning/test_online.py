@@ -6,6 +6,7 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dtfm import DTFM
 from sb3_dtfm.data import DatasetError, Trajectory, TrajectoryBuffer
@@ -77,7 +78,9 @@ def test_learning_repeats_and_is_logged_and_a_callback_ends_it(file, cheetah_buf
         th.testing.assert_close(ours, theirs, rtol=0, atol=0)
     assert models[0]._n_updates > 5
     assert {"rollout/ep_rew_mean", "rollout/ep_len_mean", "rollout/success_rate", "train/loss"} <= curves.points.keys()
-    assert models[0].learn(60, Watch(n_steps=3)).num_timesteps == 9
+    n_before = models[0].own.n_episodes
+    assert models[0].learn(60, Watch(n_steps=7)).num_timesteps == 21
+    assert models[0].own.n_episodes == n_before + 2, "those that had ended, one after four steps and one after seven"
 
 
 def episodes(returns, successes):
@@ -156,6 +159,9 @@ def test_what_it_cannot_learn_with_is_refused(file, cheetah_buffer):
         OnlineDTFM.load(file, dataset=cheetah_buffer).learn(10)
     with pytest.raises(ValueError, match="no dataset to learn from"):
         OnlineDTFM.load(file, make_venv()).learn(10)
+    normalized = VecNormalize(make_venv(), norm_obs=False)
+    with pytest.raises(ValueError, match="norm_reward=True"):
+        OnlineDTFM.load(file, normalized, dataset=cheetah_buffer).learn(10)
     for name, wrong in {"n_episodes": 0, "gradient_steps": 1.5, "own_share": 0.0}.items():
         with pytest.raises(ValueError, match=name):
             OnlineDTFM.load(file, make_venv(), dataset=cheetah_buffer, **{name: wrong})
