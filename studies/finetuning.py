@@ -6,7 +6,7 @@ What fine-tuning brought: runs of `sb3-dtfm finetune` as rows, and their curves.
     python studies/finetuning.py plot results/finetuning --labels own-episodes --output docs/studies/finetuning.png
 
 `measure` plays 100 final episodes, as `sb3-dtfm benchmark` does, with the model before (rows of the label "before") and with
-the last one after, and takes the curve from the run's evaluations.npz. Its steps are the environments', and its seconds those
+the last one after, and takes the curve from the run's evaluations.npz. Its steps are the environments', its seconds those
 until then, evaluations included. `--like` is the cell of the model before: its rows tell task, data and seed.
 """
 
