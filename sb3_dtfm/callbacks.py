@@ -74,6 +74,7 @@ class EvaluateAtStartAndEnd(BaseCallback):
         super().__init__()
         self.eval_callbacks = [evaluation for evaluation in eval_callbacks if evaluation.eval_freq > 0]
         self._evaluated_at: int | None = None
+        self._n_updates = 0  # at the newest evaluation of a full interval
 
     def go_on(self, num_timesteps: int) -> None:
         """
@@ -88,14 +89,21 @@ class EvaluateAtStartAndEnd(BaseCallback):
             self._evaluate(self.eval_callbacks)
 
     def _on_step(self) -> bool:
+        if any(evaluation.n_calls % evaluation.eval_freq == 0 for evaluation in self.eval_callbacks):
+            self._n_updates = self._updates()
         return True
+
+    def _updates(self) -> int:
+        """The model's gradient steps: one that acts and learns in turns learns on after its last step."""
+        return getattr(self.model, "_n_updates", 0)
 
     def _on_training_end(self) -> None:
         if self._evaluated_at != self.num_timesteps:
             self._evaluate([evaluation for evaluation in self.eval_callbacks if not self._just_evaluated(evaluation)])
 
     def _just_evaluated(self, evaluation: EvalCallback) -> bool:
-        return evaluation.num_timesteps == self.num_timesteps and evaluation.n_calls % evaluation.eval_freq == 0
+        just_now = evaluation.num_timesteps == self.num_timesteps and evaluation.n_calls % evaluation.eval_freq == 0
+        return just_now and self._n_updates == self._updates()
 
     def _evaluate(self, eval_callbacks: list[EvalCallback]) -> None:
         for evaluation in eval_callbacks:

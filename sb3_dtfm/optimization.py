@@ -78,7 +78,7 @@ class RunningMeans:
 
 
 # What each number of a run's random stream is for.
-BATCHES, NOISE, DROPOUT, TRANSITIONS = range(4)
+BATCHES, NOISE, DROPOUT, TRANSITIONS, OWN_BATCHES = range(5)
 
 
 def step_seed(seed: int, n_updates: int, *purpose: int) -> int:
@@ -89,7 +89,7 @@ def step_seed(seed: int, n_updates: int, *purpose: int) -> int:
 
     :param seed: of the run
     :param n_updates: gradient steps that the model has had
-    :param purpose: one of `BATCHES`, `NOISE`, `DROPOUT` and `TRANSITIONS`, and the process where each draws its own
+    :param purpose: one of `BATCHES` and those beside it, and the process where each draws its own
     """
     return int(np.random.SeedSequence([seed, n_updates, *purpose]).generate_state(1, np.uint64)[0])
 

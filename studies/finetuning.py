@@ -25,8 +25,8 @@ from sb3_dtfm.benchmark.evaluation import FINAL_STATES, evaluate, make_seeded_en
 from sb3_dtfm.benchmark.report.runs import read_studies
 from sb3_dtfm.benchmark.rows import Cell, Row, read_rows, write_row
 from sb3_dtfm.files import read_run
-from sb3_dtfm.finetuning import SteeredDTFM
 from sb3_dtfm.recording.loading import load_agent
+from sb3_dtfm.zoo.registration import STEERED
 
 N_EPISODES, N_ENVS = 100, 10
 BEFORE = "before"
@@ -42,6 +42,8 @@ def measure(run: Path, before: Path, like: Row, label: str, output: Path) -> Non
     :param label: of the rows
     :param output: folder for the files
     """
+    if run.parent.name == STEERED:
+        raise SystemExit(f"{run}: its timesteps are decisions; rows are of runs of `finetune --algo dtfm`.")
     (folder,) = (path.parent for path in run.glob("*/config.yml"))
     settings = {key: value for key, value in read_run(folder).items() if key != "callback"}
     settings = {**like["settings"], **settings}
@@ -71,12 +73,12 @@ def environment_steps(run: Path) -> np.ndarray:
 
 
 def curve(run: Path) -> list[dict[str, Any]]:
-    """Its evaluations."""
+    """Its evaluations; where there are two after as many steps, the one after the last turn's gradient steps."""
     with np.load(run / "evaluations.npz") as saved:
         columns = {name: saved[name].tolist() for name in saved.files}
     successes = columns.get("successes", [None] * len(columns["timesteps"]))
-    return [
-        {
+    rows = {
+        step: {
             "step": step,
             "final": False,
             "returns": returns,
@@ -86,7 +88,8 @@ def curve(run: Path) -> list[dict[str, Any]]:
         for step, returns, lengths, told in zip(
             columns["timesteps"], columns["results"], columns["ep_lengths"], successes, strict=True
         )
-    ]
+    }
+    return list(rows.values())
 
 
 def final_episodes(run: Path, name: str, envs: Any) -> dict[str, Any]:
@@ -97,8 +100,7 @@ def final_episodes(run: Path, name: str, envs: Any) -> dict[str, Any]:
     :param name: of its file
     :param envs: to act in
     """
-    algo, file = run.parent.name, run / f"{name}.zip"
-    model = SteeredDTFM.load(file, device="cpu") if algo == "steered" else load_agent(algo, file, "cpu")
+    model = load_agent(run.parent.name, run / f"{name}.zip", "cpu")
     seeds = range(FINAL_STATES, FINAL_STATES + N_EPISODES)
     with tqdm(total=N_EPISODES, desc=str(run)) as bar:
         return evaluate(model, envs, seeds, lambda n: bar.update(n - bar.n) and None)._asdict()

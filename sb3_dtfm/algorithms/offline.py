@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback, ProgressBarCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import configure_logger, update_learning_rate
 
@@ -49,6 +49,8 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
     Parameters are those of :class:`~sb3_dtfm.algorithms.base.OfflineAlgorithm`.
     """
 
+    progress_bar_class: type[ProgressBarCallback] = GradientStepProgressBar
+
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         if not is_first_process():
             callback, progress_bar = None, False
@@ -62,7 +64,7 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         if self.score_reference is not None:
             children.append(NormalizedScoreCallback(self.score_reference, evaluations))
         if progress_bar:
-            children.append(GradientStepProgressBar())
+            children.append(self.progress_bar_class())
         combined = CallbackList(children)
         combined.init_callback(self)
         return combined
@@ -141,10 +143,10 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         parallel.close()
         return self
 
-    def _batches(self, buffer: TrajectoryBuffer, batch_size: int) -> Iterator[Windows]:
+    def _batches(self, buffer: TrajectoryBuffer, batch_size: int, stream: int = BATCHES) -> Iterator[Windows]:
         """Batches of the gradient steps from now on, each drawn by a seed of its own."""
         assert self._training_seed is not None
-        seeds = (step_seed(self._training_seed, n_updates, BATCHES) for n_updates in itertools.count(self._n_updates))
+        seeds = (step_seed(self._training_seed, n_updates, stream) for n_updates in itertools.count(self._n_updates))
         return buffer.batches(
             batch_size,
             self.context_length,
@@ -214,10 +216,14 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         remaining = self._current_progress_remaining
-        factor = learning_rate_factor(self.learning_rate_schedule, self.num_timesteps, 1.0 - remaining, self.warmup_steps)
+        factor = learning_rate_factor(self.learning_rate_schedule, self._n_learned(), 1.0 - remaining, self.warmup_steps)
         self._current_learning_rate = factor * self.lr_schedule(remaining)
         for optimizer in optimizers if isinstance(optimizers, list) else [optimizers]:
             update_learning_rate(optimizer, self._current_learning_rate)
+
+    def _n_learned(self) -> int:
+        """Gradient steps since `learn` began to count."""
+        return self.num_timesteps
 
     def _choose_training_seed(self) -> int:
         """The run's seed; one that was drawn stays the model's."""

@@ -41,7 +41,8 @@ def main(argv: Sequence[str]) -> None:
     if "-optimize" in rest or "--optimize-hyperparameters" in rest:
         raise UsageError("-optimize: hyperparameters of finetune cannot be searched; -params changes them.")
     config = options.conf_file or finetuning_config(options.algo)
-    eval_freq = options.eval_freq or (EVAL_FREQ_ONLINE if options.algo == ONLINE else EVAL_FREQ)
+    usual = EVAL_FREQ_ONLINE if options.algo == ONLINE else EVAL_FREQ
+    eval_freq = usual if options.eval_freq is None else options.eval_freq
     given = ["--algo", options.algo, "--conf-file", str(config), "--eval-freq", str(eval_freq)]
     arguments = [*given, "--eval-episodes", str(options.eval_episodes), *rest]
     commands.finetune(arguments, options.model, options.target_return, argv, resumed)

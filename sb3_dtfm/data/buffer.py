@@ -347,7 +347,8 @@ class TrajectoryBuffer:
             if other.env_id is not None:
                 named.check_task(other.env_id)
         tensors = {
-            name: th.cat([getattr(each, name).index_select(0, each.rows) for each in buffers]) for name in STEP_ARRAYS
+            name: th.cat([getattr(each, name).index_select(0, each.rows).to(first.observations.device) for each in buffers])
+            for name in STEP_ARRAYS
         }
         table = EpisodeTable(*map(np.concatenate, zip(*(each.episodes for each in buffers), strict=True)))
         table = table._replace(starts=np.cumsum(table.lengths) - table.lengths)

@@ -8,18 +8,19 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dtfm.algorithms import DTFM
-from sb3_dtfm.arguments import COUNT, Number, Rule, check_arguments
+from sb3_dtfm.arguments import COUNT, POSITIVE, Number, Rule, check_arguments
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer, load_dataset
 from sb3_dtfm.distributed import DataParallel, n_processes
 from sb3_dtfm.envs import OBSERVATION, return_to_go_space
 from sb3_dtfm.envs.success import reported_success
-from sb3_dtfm.windows import Transitions, Windows
+from sb3_dtfm.optimization import BATCHES, OWN_BATCHES, RunningMeans
+from sb3_dtfm.windows import Context, Transitions, Windows
 
 SelfOnlineDTFM = TypeVar("SelfOnlineDTFM", bound="OnlineDTFM")
 
@@ -72,6 +73,7 @@ class OnlineDTFM(DTFM):
         self._running: list[Step] = []  # of the episodes that have not ended
         self._began: list[int] = []  # where each environment's episode begins in them
         self._state: tuple[np.ndarray, ...] | None = None  # of acting
+        self._n_updates_at_start = 0
         super().__init__(*args, **kwargs)
 
     def _check_arguments(self, learning_rate: Rule) -> None:
@@ -80,19 +82,24 @@ class OnlineDTFM(DTFM):
 
     def _excluded_save_params(self) -> list[str]:
         """Also what a DTFM, whose file it is saved as, does not have."""
-        return [*super()._excluded_save_params(), *ACCEPTED, "own", "_running", "_began", "_state"]
+        return [*super()._excluded_save_params(), *ACCEPTED, "own", "_running", "_began", "_state", "_n_updates_at_start"]
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         """SB3's own, for the environments count here."""
+        self._check_arguments(learning_rate=POSITIVE)
         before = self._last_obs
         self._training_seconds, self._timed_steps = 0.0, 0
         total_timesteps, callback = BaseAlgorithm._setup_learn(self, *args, **kwargs)
+        if self._num_timesteps_at_start == 0:
+            self._means, self._n_updates_at_start = RunningMeans(), self._n_updates
         if self._last_obs is not before:  # they have been reset
             self._running, self._began, self._state = [], [0] * self.n_envs, None
         return total_timesteps, callback
 
-    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
-        return BaseAlgorithm._init_callback(self, callback, progress_bar)
+    progress_bar_class = ProgressBarCallback
+
+    def _n_learned(self) -> int:
+        return self._n_updates - self._n_updates_at_start
 
     def learn(
         self: SelfOnlineDTFM,
@@ -128,14 +135,16 @@ class OnlineDTFM(DTFM):
         self._training_seed = self._choose_training_seed()
         callback.on_training_start(locals(), globals())
         n_learned = 0
-        while self.num_timesteps < total_timesteps and self._collect(callback):
+        while self.num_timesteps < total_timesteps:
+            # Of a turn's beginning: it ends with an episode, and the last one so beyond the steps that were asked for.
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
-            batches = self._imitated()
-            for _ in range(self.gradient_steps):
-                self._train_step(batches, parallel)
+            if not self._collect(callback):
+                break
+            self._imitate(parallel)
             n_learned += 1
             if log_interval and n_learned % log_interval == 0:
                 self.dump_logs()
+        self._check_finite(self._means.sums(), self._means.n_values)
         callback.on_training_end()
         return self
 
@@ -164,22 +173,24 @@ class OnlineDTFM(DTFM):
         ended: list[Trajectory] = []
         goes_on = True
         callback.on_rollout_start()
-        while goes_on and len(ended) < self.n_episodes:
-            observations: Any = self._last_obs
-            actions, self._state = self.policy.predict(observations, self._state, self._last_episode_starts)
-            self._last_obs, rewards, dones, infos = self.env.step(actions)  # type: ignore[assignment]
-            self._last_episode_starts = dones
-            self._running.append(Step(observations[OBSERVATION], actions, rewards))
-            self._update_info_buffer(infos, dones)
-            ended += [self._take(row, infos[row]) for row in np.flatnonzero(dones)]
-            self.num_timesteps += self.n_envs
-            callback.update_locals(locals())
-            goes_on = callback.on_step()
+        try:
+            while goes_on and len(ended) < self.n_episodes:
+                observations: Any = self._last_obs
+                actions, self._state = self.policy.predict(observations, self._state, self._last_episode_starts)
+                self._last_obs, rewards, dones, infos = self.env.step(actions)  # type: ignore[assignment]
+                self._last_episode_starts = dones
+                self._running.append(Step(observations[OBSERVATION], actions, rewards))
+                self._update_info_buffer(infos, dones)
+                ended += [self._take(row, infos[row]) for row in np.flatnonzero(dones)]
+                self.num_timesteps += self.n_envs
+                callback.update_locals(locals())
+                goes_on = callback.on_step()
+        finally:  # also what an interrupt ends
+            if ended:
+                self._keep(ended)
         callback.on_rollout_end()
         n_past = min(self._began)
         self._running, self._began = self._running[n_past:], [began - n_past for began in self._began]
-        if ended:
-            self._keep(ended)
         return goes_on
 
     def _take(self, row: int, info: dict[str, Any]) -> Trajectory:
@@ -196,7 +207,9 @@ class OnlineDTFM(DTFM):
         assert self.buffer is not None
         known = (self.action_space, self.buffer.observation_space)
         new = TrajectoryBuffer.from_trajectories(episodes, *known, source="own episodes", env_id=self.buffer.env_id)
-        new = new if self.own is None else TrajectoryBuffer.join([self.own, new], [1.0, 1.0])
+        if self.own is not None:
+            self.own.action_space = self.action_space  # a file's is of single precision, as its bounds
+            new = TrajectoryBuffer.join([self.own, new], [1.0, 1.0])
         self.own = new.to(self.device)
 
     def save_replay_buffer(self, path: str | PathLike[str]) -> None:
@@ -222,6 +235,15 @@ class OnlineDTFM(DTFM):
         self._check_spaces(return_to_go_space(own.observation_space), own.action_space, f"{path} holds", "the model's are")
         self.own = own.to(self.device)
 
+    def _imitate(self, parallel: DataParallel) -> None:
+        """The gradient steps of a turn; what acting has kept of the old weights' keys and values goes."""
+        batches = self._imitated()
+        for _ in range(self.gradient_steps):
+            self._train_step(batches, parallel)
+        if self._state is not None:
+            context = Context(*self._state)
+            self._state = tuple(context._replace(keys_values=np.zeros((len(context.mask), 0), np.float32)))
+
     def _imitated(self) -> Iterator[Windows]:
         """Batches of the dataset and of the own episodes that are worth it."""
         assert self.buffer is not None
@@ -230,8 +252,9 @@ class OnlineDTFM(DTFM):
         successes, returns = self.own.successes, self.own.episode_returns
         worthy = np.flatnonzero(np.where(np.isnan(successes), returns >= average, successes == 1.0))
         n_own = round(self.own_share * self.batch_size) if len(worthy) else 0
-        parts = [(self.buffer, self.batch_size - n_own), *([(self.own.select(worthy), n_own)] if n_own else [])]
-        streams = [self._batches(buffer, size) for buffer, size in parts if size]
+        own = [(self.own.select(worthy), n_own, OWN_BATCHES)] if n_own else []
+        parts = [(self.buffer, self.batch_size - n_own, BATCHES), *own]
+        streams = [self._batches(buffer, size, stream) for buffer, size, stream in parts if size]
         return (Windows(*map(th.cat, zip(*batches, strict=True))) for batches in zip(*streams, strict=True))
 
     def _sample_transitions(self, batch_size: int, generator: th.Generator) -> Transitions:
@@ -244,6 +267,11 @@ class OnlineDTFM(DTFM):
             return own
         others = super()._sample_transitions(batch_size - n_own, generator)
         return Transitions(*map(th.cat, zip(others, own, strict=True)))
+
+    def _name_steps(self, n_steps: int) -> str:
+        return (
+            f"within {n_steps} steps to gradient step {self._n_updates} of this model, on its dataset and its own episodes"
+        )
 
     def dump_logs(self) -> None:
         """Log what SB3's online algorithms do, and the means since the last call."""

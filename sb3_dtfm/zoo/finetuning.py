@@ -21,12 +21,14 @@ from sb3_dtfm.finetuning import NoiseActionVecEnv, OnlineDTFM, SteeredDTFM
 from sb3_dtfm.zoo.arguments import UsageError
 from sb3_dtfm.zoo.manager import OF_RL_ZOO, OfflineExperimentManager
 from sb3_dtfm.zoo.registration import STEERED
-from sb3_dtfm.zoo.resuming import EPISODES
+from sb3_dtfm.zoo.resuming import CHECKPOINT, EPISODES
 
 # The key of the settings of a NoiseActionVecEnv in a run's config.yml, where `enjoy` must not find a wrapper.
 NOISE_ENV = "noise_env"
 # The online algorithm itself, as Stable-Baselines3 saves it.
 AGENT = "agent"
+# Arguments of an algorithm that the command line gives.
+OF_THE_COMMAND = ("env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model")
 
 
 class SteeredCallbacks(BaseCallback):
@@ -228,6 +230,8 @@ class OnlineManager(FinetuningManager):
         super().__init__(*args, **kwargs)
         if not self.continue_training:  # else the checkpoint of a run that is resumed
             self.trained_agent, self.continue_training = str(self.base_file), True
+        self.save_replay_buffer = False  # it is, as episodes.npz
+        self.signals.between_steps = False  # of which a turn has many, and none is repeated to the bit anyway
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """
@@ -236,17 +240,20 @@ class OnlineManager(FinetuningManager):
         :raises UsageError: no dataset, or a name that it does not know
         """
         hyperparams, saved = super().read_hyperparameters()
-        known = {*inspect.signature(DTFM).parameters, *inspect.signature(OnlineDTFM).parameters, *OF_RL_ZOO}
+        algorithms = {*inspect.signature(DTFM).parameters, *inspect.signature(OnlineDTFM).parameters}
+        known = {*algorithms, *OF_RL_ZOO} - set(OF_THE_COMMAND)
         unknown = sorted(set(hyperparams) - known)
         if unknown:
             raise UsageError(f"{with_nearest(unknown, sorted(known))}: no hyperparameter of finetune --algo dtfm.")
+        if "policy_kwargs" in hyperparams:
+            raise UsageError("policy_kwargs: are those of the model that goes on, and cannot be changed.")
         if not hyperparams.get("dataset"):
             raise UsageError(f"-params dataset:...: needed, as {self.base} does not tell what it learned from.")
         return hyperparams, saved
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         """RL-Zoo's, by this algorithm."""
-        settings = {key: value for key, value in hyperparams.items() if key not in ("policy", "policy_kwargs")}
+        settings = {key: value for key, value in hyperparams.items() if key != "policy"}
         about: dict[str, Any] = dict(
             seed=self.seed, tensorboard_log=self.tensorboard_log, verbose=self.verbose, device=self.device
         )
@@ -254,7 +261,18 @@ class OnlineManager(FinetuningManager):
         own = Path(self.trained_agent).with_name(EPISODES)
         if own.is_file():
             model.load_replay_buffer(own)
+        if Path(self.trained_agent).name != CHECKPOINT:
+            model.num_timesteps = 0  # those of the model's own training are not this run's
+        elif self.seed is not None:  # not the episodes once more that it began with
+            env.seed((self.seed + model.num_timesteps) % 2**31)
+            model.policy.seed_noise((self.seed + model.num_timesteps) % 2**31)
         return model
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        """RL-Zoo's; the monitors of a run that is resumed are written on."""
+        if self.resumed is not None:
+            self.monitor_kwargs = {**self.monitor_kwargs, "override_existing": False}
+        return super().create_envs(n_envs, eval_env, no_log)
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """

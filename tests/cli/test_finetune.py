@@ -85,7 +85,7 @@ def test_a_dtfm_goes_on_from_its_own_episodes(run, workplace, capsys):
         assert main([*command, "--eval-freq", "40", "--eval-episodes", "2"]) == 0
         online = workplace / f"logs/dtfm/HalfCheetah-v5_{number}"
         evaluations = np.load(online / "evaluations.npz")
-        assert evaluations["timesteps"].tolist() == [0, 40, 80]
+        assert evaluations["timesteps"].tolist() == [0, 40, 80, 80], "before and after the gradient steps of the last turn"
         assert evaluations["ep_lengths"].max() == 20, "of the run's own environment"
         own = load_dataset(online / "episodes.npz")
         assert own.episode_lengths.tolist() == [20] * (n_before + 4)
@@ -129,6 +129,23 @@ def test_online_learning_that_was_interrupted_goes_on(run, workplace, capsys, mo
     assert not (online / "checkpoint.zip").exists()
 
 
+def test_a_run_that_ended_before_its_first_checkpoint_begins_anew(run, workplace, monkeypatch):
+    """And not with the steps of the model that it goes on from, which are four, for its own."""
+    settings = ["--algo", "dtfm", "--save-replay-buffer", "-params", "n_episodes:2", "gradient_steps:2", "batch_size:4"]
+    command = ["finetune", "--env", "HalfCheetah-v5", "--model", str(run), "-n", "40", "--seed", "1", *settings, "n_envs:1"]
+    with monkeypatch.context() as patch:
+        patch.setattr(OnlineDTFM, "_collect", lambda *_: signal.raise_signal(signal.SIGINT))
+        assert main([*command, "--eval-freq", "0"]) == 0
+    online = workplace / "logs/dtfm/HalfCheetah-v5_2"
+    (online / "checkpoint.zip").unlink(missing_ok=True)
+    n_updates = DTFM.load(online / "HalfCheetah-v5")._n_updates
+    assert main(["finetune", "--resume", str(online)]) == 0
+    model = DTFM.load(online / "HalfCheetah-v5")
+    assert (model.num_timesteps, model._n_updates) == (40, n_updates + 2)
+    assert load_dataset(online / "episodes.npz").n_episodes == 2
+    assert not list(online.glob("replay_buffer*"))
+
+
 @pytest.mark.slow
 def test_the_online_algorithm_goes_on_learning(run, workplace):
     arguments = ["--model", str(run), "--save-replay-buffer", "-params", *QUICK]
@@ -150,6 +167,8 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
         f"--model {run} --algo td3": "--algo td3: no packaged settings; those of dtfm, ppo, sac, tqc are.",
         "--model alone.zip --algo dtfm --target-return 3": "dataset:...: needed, as alone.zip does not tell what it learned",
         f"--model {run} --algo dtfm -params n_episods:3": "n_episods (did you mean n_episodes?): no hyperparameter of",
+        f"--model {run} --algo dtfm -params verbose:0": "verbose: no hyperparameter of finetune --algo dtfm.",
+        f"--model {run} --algo dtfm -params policy_kwargs:dict(n_candidates=4)": "policy_kwargs: are those of the model",
         "--resume logs/dtfm/HalfCheetah-v5_1 --seed 3": "takes no other arguments",
         f"--model {run} -params {wrong}": "expected sb3_dtfm.finetuning.NoiseActionVecEnv alone.",
         f"--model {run} -params use_sde:True": "its exploration depends on the state (use_sde)",

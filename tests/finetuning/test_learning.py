@@ -45,14 +45,14 @@ def demonstrations():
         yield Trajectory(observations, 0.8 * actions + rng.normal(0, 0.05, (N_STEPS, 1)), np.ones(N_STEPS), True)
 
 
-def small_flow_of_two_sides() -> tuple[DTFM, list[Trajectory]]:
+def small_flow_of_two_sides(n_steps: int = 400) -> tuple[DTFM, list[Trajectory]]:
     """A trained flow that goes to either side, and what it learned from."""
     trunk = dict(embed_dim=16, n_layers=1, n_heads=1, dropout=0.0, tokens_per_step=1, clip_return_to_go=True)
     flow = dict(flow_hidden_dim=32, flow_n_layers=2, n_solver_steps=5, flow_prediction="action", one_step=False)
     settings = dict(context_length=1, batch_size=64, learning_rate=3e-3, learning_rate_schedule="cosine", seed=0)
     data = list(demonstrations())
     model = DTFM("MultiInputPolicy", None, data, device="cpu", policy_kwargs={**trunk, **flow}, **settings)
-    return model.learn(400), data
+    return model.learn(n_steps), data
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -12,6 +13,7 @@ from sb3_dtfm import DTFM
 from sb3_dtfm.data import DatasetError, Trajectory, TrajectoryBuffer
 from sb3_dtfm.envs import OBSERVATION, ReturnToGoWrapper
 from sb3_dtfm.finetuning import OnlineDTFM
+from sb3_dtfm.windows import Context
 from tests.algorithms.small import make_model, record_curves
 from tests.finetuning.test_learning import Sides, small_flow_of_two_sides
 from tests.finetuning.test_noise_env import CHUNKS, make_venv
@@ -165,6 +167,78 @@ def test_what_it_cannot_learn_with_is_refused(file, cheetah_buffer):
     for name, wrong in {"n_episodes": 0, "gradient_steps": 1.5, "own_share": 0.0}.items():
         with pytest.raises(ValueError, match=name):
             OnlineDTFM.load(file, make_venv(), dataset=cheetah_buffer, **{name: wrong})
+
+
+def test_the_learning_rate_ends_where_it_should(file, cheetah_buffer):
+    """A turn ends with an episode, beyond the steps that were asked for; warm-up counts gradient steps."""
+    settings = dict(ONLINE, learning_rate=0.1, learning_rate_schedule="linear", n_episodes=1, gradient_steps=1)
+    model = OnlineDTFM.load(file, make_venv((10,), (False,)), dataset=cheetah_buffer, **settings)
+    rates = []
+    model._gradient_step = lambda *_: (
+        model._update_learning_rate(model.policy.optimizer),
+        rates.append(model._current_learning_rate),
+    )
+    model.learn(35)
+    np.testing.assert_allclose(rates, 0.1 * (1 - np.array([0, 10, 20, 30]) / 35))
+    model.warmup_steps, model.learning_rate_schedule = 4, "constant"
+    rates.clear()
+    model._gradient_step = lambda *_: (
+        model._update_learning_rate(model.policy.optimizer),
+        rates.append(model._current_learning_rate),
+        vars(model).update(_n_updates=model._n_updates + 1),
+    )
+    model.learn(45)
+    np.testing.assert_allclose(rates, 0.1 * np.array([0.25, 0.5, 0.75, 1.0, 1.0]))
+
+
+def test_episodes_that_had_ended_survive_an_interrupt(model):
+    class Interrupt(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.n_calls == 9:
+                raise KeyboardInterrupt
+            return True
+
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(90, Interrupt())
+    assert model.own.episode_lengths.tolist() == [4, 7, 4]
+
+
+def test_kept_keys_and_values_are_those_of_the_present_weights(cheetah_buffer, tmp_path):
+    policy_kwargs = dict(kv_cache=True)
+    make_model(DTFM, cheetah_buffer, policy_kwargs=policy_kwargs).learn(2).save(tmp_path / "cached.zip")
+    model = OnlineDTFM.load(tmp_path / "cached.zip", make_venv(), dataset=cheetah_buffer, **ONLINE)
+    seen = []
+    predict = model.policy.predict
+    model.policy.predict = lambda observation, state, *args: (seen.append(state), predict(observation, state, *args))[1]
+    model.learn(40)
+    sizes = [0 if state is None else Context(*state).keys_values.shape[1] for state in seen]
+    turns = [i for i, size in enumerate(sizes) if size == 0]
+    assert turns[0] == 0
+    assert len(turns) > 1
+
+
+def test_own_episodes_of_double_precision_are_taken_up(tmp_path):
+    offline, demonstrations = small_flow_of_two_sides(n_steps=2)
+    offline.save(tmp_path / "offline.zip")
+
+    class Double(Sides):
+        action_space = spaces.Box(-1.0, 1.0, (1,), np.float64)
+
+    venv = make_vec_env(Double, 2, wrapper_class=ReturnToGoWrapper, wrapper_kwargs=dict(target_return=1.0))
+    model = OnlineDTFM.load(tmp_path / "offline.zip", venv, dataset=demonstrations, **ONLINE).learn(8)
+    model.save_replay_buffer(tmp_path / "own.npz")
+    model.load_replay_buffer(tmp_path / "own.npz")
+    n_before = model.own.n_episodes
+    assert model.learn(8).own.n_episodes > n_before
+
+
+def test_a_learning_rate_that_no_file_holds_is_asked_for_again(cheetah_buffer, tmp_path):
+    def rate(remaining: float) -> float:
+        return 1e-3
+
+    make_model(DTFM, cheetah_buffer, learning_rate=rate).learn(2).save(tmp_path / "offline.zip")
+    with pytest.raises(ValueError, match="learning_rate was the function rate"):
+        OnlineDTFM.load(tmp_path / "offline.zip", make_venv(), dataset=cheetah_buffer, **ONLINE).learn(10)
 
 
 @pytest.mark.slow
