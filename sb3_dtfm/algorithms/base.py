@@ -375,6 +375,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
                 f"cannot be changed: got {changed['policy_kwargs']}."
             )
         model = cls(attributes["policy_class"], device=device, _init_setup_model=False)
+        if attributes.get("steering") is not None and not hasattr(model, "steering"):
+            raise ModelFileError(f"{source} is a DTFM with its steering; sb3_dtfm.finetuning.SteeredDTFM loads it.")
         vars(model).update(attributes)
         with naming_the_file(source):
             model._check_sizes(tensors[POLICY], source)
