@@ -47,7 +47,7 @@ ROOMS = {
     ),
     "finetuning": (
         "sb3_dtfm/finetuning",
-        {"finetuning", "algorithms", "arguments", "data", "distributed", "envs", "policies", "windows"},
+        {"finetuning", "algorithms", "arguments", "data", "distributed", "envs", "optimization", "policies", "windows"},
     ),
     "zoo": (
         "sb3_dtfm/zoo",
