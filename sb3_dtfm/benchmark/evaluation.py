@@ -51,7 +51,7 @@ class SeededEpisodes(gym.Wrapper):
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
-        self._seeds: list[int] = []
+        self._seeds: list[int] | None = None  # nobody has set any
         self._start: tuple[Any, dict[str, Any]] | None = None
         self._rests = False
 
@@ -62,8 +62,8 @@ class SeededEpisodes(gym.Wrapper):
         self._seeds = list(seeds)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        self._rests = not self._seeds
-        if self._seeds or self._start is None:
+        self._rests = self._seeds == []
+        if not self._rests or self._start is None:
             self._start = self.env.reset(seed=self._seeds.pop(0) if self._seeds else seed, options=options)
         return self._start
 

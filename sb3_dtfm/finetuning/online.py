@@ -63,6 +63,8 @@ class OnlineDTFM(DTFM):
     :ivar own: all own episodes, None before the first ones
     """
 
+    progress_bar_class = ProgressBarCallback
+
     def __init__(
         self, *args: Any, n_episodes: int = 10, gradient_steps: int = 100, own_share: float = 0.5, **kwargs: Any
     ) -> None:
@@ -95,8 +97,6 @@ class OnlineDTFM(DTFM):
         if self._last_obs is not before:  # they have been reset
             self._running, self._began, self._state = [], [0] * self.n_envs, None
         return total_timesteps, callback
-
-    progress_bar_class = ProgressBarCallback
 
     def _n_learned(self) -> int:
         return self._n_updates - self._n_updates_at_start
@@ -134,15 +134,15 @@ class OnlineDTFM(DTFM):
         parallel = DataParallel(self.policy, self._loss_function(), self.batch_size)
         self._training_seed = self._choose_training_seed()
         callback.on_training_start(locals(), globals())
-        n_learned = 0
+        n_turns = 0
         while self.num_timesteps < total_timesteps:
             # Of a turn's beginning: it ends with an episode, and the last one so beyond the steps that were asked for.
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
             if not self._collect(callback):
                 break
             self._imitate(parallel)
-            n_learned += 1
-            if log_interval and n_learned % log_interval == 0:
+            n_turns += 1
+            if log_interval and n_turns % log_interval == 0:
                 self.dump_logs()
         self._check_finite(self._means.sums(), self._means.n_values)
         callback.on_training_end()

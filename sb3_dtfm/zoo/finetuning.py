@@ -18,10 +18,11 @@ from sb3_dtfm.arguments import with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.files import read_run
 from sb3_dtfm.finetuning import NoiseActionVecEnv, OnlineDTFM, SteeredDTFM
+from sb3_dtfm.finetuning.online import ACCEPTED
 from sb3_dtfm.zoo.arguments import UsageError
 from sb3_dtfm.zoo.manager import OF_RL_ZOO, OfflineExperimentManager
 from sb3_dtfm.zoo.registration import STEERED
-from sb3_dtfm.zoo.resuming import CHECKPOINT, EPISODES
+from sb3_dtfm.zoo.resuming import EPISODES
 
 # The key of the settings of a NoiseActionVecEnv in a run's config.yml, where `enjoy` must not find a wrapper.
 NOISE_ENV = "noise_env"
@@ -228,7 +229,10 @@ class OnlineManager(FinetuningManager):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        if not self.continue_training:  # else the checkpoint of a run that is resumed
+        self.has_checkpoint = self.resumed is not None and self.continue_training
+        if self.continue_training and not self.has_checkpoint:
+            raise UsageError(f"-i {self.trained_agent}: --model names what goes on; its run's own episodes come with it.")
+        if not self.has_checkpoint:
             self.trained_agent, self.continue_training = str(self.base_file), True
         self.save_replay_buffer = False  # it is, as episodes.npz
         self.signals.between_steps = False  # of which a turn has many, and none is repeated to the bit anyway
@@ -240,8 +244,7 @@ class OnlineManager(FinetuningManager):
         :raises UsageError: no dataset, or a name that it does not know
         """
         hyperparams, saved = super().read_hyperparameters()
-        algorithms = {*inspect.signature(DTFM).parameters, *inspect.signature(OnlineDTFM).parameters}
-        known = {*algorithms, *OF_RL_ZOO} - set(OF_THE_COMMAND)
+        known = {*inspect.signature(DTFM).parameters, *ACCEPTED, *OF_RL_ZOO} - set(OF_THE_COMMAND)
         unknown = sorted(set(hyperparams) - known)
         if unknown:
             raise UsageError(f"{with_nearest(unknown, sorted(known))}: no hyperparameter of finetune --algo dtfm.")
@@ -261,11 +264,12 @@ class OnlineManager(FinetuningManager):
         own = Path(self.trained_agent).with_name(EPISODES)
         if own.is_file():
             model.load_replay_buffer(own)
-        if Path(self.trained_agent).name != CHECKPOINT:
+        if not self.has_checkpoint:
             model.num_timesteps = 0  # those of the model's own training are not this run's
-        elif self.seed is not None:  # not the episodes once more that it began with
-            env.seed((self.seed + model.num_timesteps) % 2**31)
-            model.policy.seed_noise((self.seed + model.num_timesteps) % 2**31)
+        else:  # not the episodes once more that it began with
+            seed = (self.seed + model.num_timesteps) % 2**31
+            env.seed(seed)
+            model.policy.seed_noise(seed)
         return model
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:

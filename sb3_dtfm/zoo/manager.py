@@ -130,9 +130,8 @@ class OfflineExperimentManager(ExperimentManager):
         if self.keeper is not None and ended:
             self.keeper.remove()
         elif self.keeper is not None:
-            if self.signals.asked and not (
-                self.signals.between_steps and self.signals.at_once
-            ):  # else in the midst of a step
+            midst_of_a_step = self.signals.between_steps and self.signals.at_once
+            if self.signals.asked and not midst_of_a_step:
                 self.keeper.save()
             print(
                 f"Interrupted after {model.num_timesteps} steps; sb3-dtfm {self.command} --resume {self.save_path} goes on."

@@ -86,6 +86,13 @@ def test_environments_that_nobody_waits_for_are_not_stepped():
     assert env.get_attr("n_steps") == [2, 90, 3, 0, 0]
 
 
+def test_an_environment_that_was_told_no_seeds_is_as_any_other():
+    env = vec_env(1)
+    env.seed(4)
+    env.reset()
+    assert [bool(env.step(np.zeros((1, 1)))[2][0]) for _ in range(5)] == [False, False, False, True, True]
+
+
 def test_evaluations_repeat_on_the_same_environments():
     env = vec_env(3)
     seeds = [4, 7, 2, 6]

@@ -167,6 +167,7 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
         f"--model {run} --algo td3": "--algo td3: no packaged settings; those of dtfm, ppo, sac, tqc are.",
         "--model alone.zip --algo dtfm --target-return 3": "dataset:...: needed, as alone.zip does not tell what it learned",
         f"--model {run} --algo dtfm -params n_episods:3": "n_episods (did you mean n_episodes?): no hyperparameter of",
+        f"--model {run} --algo dtfm -i alone.zip": "-i alone.zip: --model names what goes on",
         f"--model {run} --algo dtfm -params verbose:0": "verbose: no hyperparameter of finetune --algo dtfm.",
         f"--model {run} --algo dtfm -params policy_kwargs:dict(n_candidates=4)": "policy_kwargs: are those of the model",
         "--resume logs/dtfm/HalfCheetah-v5_1 --seed 3": "takes no other arguments",

@@ -217,6 +217,13 @@ def test_kept_keys_and_values_are_those_of_the_present_weights(cheetah_buffer, t
     assert len(turns) > 1
 
 
+def test_own_episodes_on_another_device_are_joined(cheetah_buffer):
+    """As a GPU's buffer is in the second turn; "meta" is a device that every machine has."""
+    joined = TrajectoryBuffer.join([cheetah_buffer.to("meta"), cheetah_buffer], [1.0, 1.0])
+    assert joined.observations.device.type == "meta"
+    assert joined.n_episodes == 2 * cheetah_buffer.n_episodes
+
+
 def test_own_episodes_of_double_precision_are_taken_up(tmp_path):
     offline, demonstrations = small_flow_of_two_sides(n_steps=2)
     offline.save(tmp_path / "offline.zip")
