@@ -14,12 +14,12 @@ from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dtfm.algorithms import DTFM
-from sb3_dtfm.arguments import COUNT, POSITIVE, Number, Rule, check_arguments
+from sb3_dtfm.arguments import COUNT, POSITIVE, Rule, check_arguments
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer, load_dataset
 from sb3_dtfm.distributed import DataParallel, n_processes
 from sb3_dtfm.envs import OBSERVATION, return_to_go_space
 from sb3_dtfm.envs.success import reported_success
-from sb3_dtfm.optimization import BATCHES, OWN_BATCHES, RunningMeans
+from sb3_dtfm.optimization import OWN_BATCHES, RunningMeans
 from sb3_dtfm.windows import Context, Transitions, Windows
 
 SelfOnlineDTFM = TypeVar("SelfOnlineDTFM", bound="OnlineDTFM")
@@ -27,7 +27,6 @@ SelfOnlineDTFM = TypeVar("SelfOnlineDTFM", bound="OnlineDTFM")
 ACCEPTED: dict[str, Rule] = {
     "n_episodes": COUNT,
     "gradient_steps": COUNT,
-    "own_share": Number(low=0, high=1, above_low=True),
 }
 
 
@@ -59,18 +58,14 @@ class OnlineDTFM(DTFM):
 
     :param n_episodes: own episodes between two times of learning, of all environments together
     :param gradient_steps: each of these times
-    :param own_share: share of a batch that is from own episodes, once one is worth it; the rest is from the dataset
     :ivar own: all own episodes, None before the first ones
     """
 
     progress_bar_class = ProgressBarCallback
 
-    def __init__(
-        self, *args: Any, n_episodes: int = 10, gradient_steps: int = 100, own_share: float = 0.5, **kwargs: Any
-    ) -> None:
+    def __init__(self, *args: Any, n_episodes: int = 10, gradient_steps: int = 100, **kwargs: Any) -> None:
         self.n_episodes = n_episodes
         self.gradient_steps = gradient_steps
-        self.own_share = own_share
         self.own: TrajectoryBuffer | None = None
         self._running: list[Step] = []  # of the episodes that have not ended
         self._began: list[int] = []  # where each environment's episode begins in them
@@ -251,17 +246,24 @@ class OnlineDTFM(DTFM):
         average = np.concatenate([self.buffer.episode_returns, self.own.episode_returns]).mean()
         successes, returns = self.own.successes, self.own.episode_returns
         worthy = np.flatnonzero(np.where(np.isnan(successes), returns >= average, successes == 1.0))
-        n_own = round(self.own_share * self.batch_size) if len(worthy) else 0
-        own = [(self.own.select(worthy), n_own, OWN_BATCHES)] if n_own else []
-        parts = [(self.buffer, self.batch_size - n_own, BATCHES), *own]
-        streams = [self._batches(buffer, size, stream) for buffer, size, stream in parts if size]
+        imitated = self.own.select(worthy) if len(worthy) else None
+        n_own = self._n_own(imitated, self.batch_size) if imitated is not None else 0
+        streams = [self._batches(self.buffer, self.batch_size - n_own)] if n_own < self.batch_size else []
+        if imitated is not None:
+            streams.append(self._batches(imitated, n_own, OWN_BATCHES))
         return (Windows(*map(th.cat, zip(*batches, strict=True))) for batches in zip(*streams, strict=True))
+
+    def _n_own(self, own: TrajectoryBuffer, batch_size: int) -> int:
+        """How many of a batch are from own episodes, so that their steps count as much as the dataset's."""
+        assert self.buffer is not None
+        share = len(own) / (len(own) + len(self.buffer))
+        return max(round(share * batch_size), 1)
 
     def _sample_transitions(self, batch_size: int, generator: th.Generator) -> Transitions:
         """Of all episodes, so many own ones as are imitated."""
         if self.own is None:
             return super()._sample_transitions(batch_size, generator)
-        n_own = round(self.own_share * batch_size)
+        n_own = self._n_own(self.own, batch_size)
         own = self.own.sample_transitions(n_own, self.policy.n_valued, self.policy.gamma, generator)
         if n_own == batch_size:
             return own

@@ -85,11 +85,11 @@ def test_learning_repeats_and_is_logged_and_a_callback_ends_it(file, cheetah_buf
     assert models[0].own.n_episodes == n_before + 2, "those that had ended, one after four steps and one after seven"
 
 
-def episodes(returns, successes):
-    """Own episodes of three steps whose observations tell which one they are of."""
+def episodes(returns, successes, first=100.0):
+    """Episodes of three steps whose observations tell which one they are of."""
     return TrajectoryBuffer.from_trajectories(
         [
-            Trajectory(np.full((3, 17), 100.0 + i), np.zeros((3, 6)), np.array([0.0, 0.0, value]), True, success=success)
+            Trajectory(np.full((3, 17), first + i), np.zeros((3, 6)), np.array([0.0, 0.0, value]), True, success=success)
             for i, (value, success) in enumerate(zip(returns, successes, strict=True))
         ],
         make_venv().action_space,
@@ -99,10 +99,14 @@ def episodes(returns, successes):
 @pytest.mark.parametrize(
     ("successes", "worthy"), [([True, False, None, None], {0, 3}), ([False] * 4, set())], ids=["some", "none"]
 )
-def test_so_many_steps_are_of_own_episodes_that_succeeded(model, cheetah_buffer, successes, worthy):
-    """Where nobody tells of success, an episode counts that is above the average: of the last two the second one."""
-    model.set_dataset(cheetah_buffer)
-    model.own_share, model._training_seed = 0.25, 0
+def test_so_many_steps_are_of_own_episodes_that_succeeded(model, successes, worthy):
+    """
+    A quarter of what is imitated is own.
+
+    Where nobody tells of success, an episode counts that is above the average: of the last two the second one.
+    """
+    model.set_dataset(episodes([0.0] * 6, [None] * 6, first=0.0))
+    model._training_seed = 0
     model.own = episodes([-1e3, 1e3, -1e3, 1e3], successes)
     _, *batches = zip(range(20), model._imitated(), strict=False)
     present = {round(float(each) - 100) for _, batch in batches for each in batch.observations[:, -1, 0] if each > 50}
@@ -145,7 +149,7 @@ def test_a_critic_learns_of_all_episodes(cheetah_buffer, tmp_path):
     policy_kwargs = dict(CHUNKS, critic_steps=2, n_candidates=4)
     make_model(DTFM, cheetah_buffer, policy_kwargs=policy_kwargs).learn(2).save(tmp_path / "guided.zip")
     model = OnlineDTFM.load(tmp_path / "guided.zip", make_venv(), dataset=cheetah_buffer, **ONLINE)
-    model.set_dataset(cheetah_buffer)
+    model.set_dataset(episodes([0.0] * 4, [None] * 4, first=0.0))
     model.own = episodes([-1e3] * 4, [False] * 4)
     generator = th.Generator().manual_seed(0)
     batch = model._sample_transitions(64, generator)
@@ -164,7 +168,7 @@ def test_what_it_cannot_learn_with_is_refused(file, cheetah_buffer):
     normalized = VecNormalize(make_venv(), norm_obs=False)
     with pytest.raises(ValueError, match="norm_reward=True"):
         OnlineDTFM.load(file, normalized, dataset=cheetah_buffer).learn(10)
-    for name, wrong in {"n_episodes": 0, "gradient_steps": 1.5, "own_share": 0.0}.items():
+    for name, wrong in {"n_episodes": 0, "gradient_steps": 1.5}.items():
         with pytest.raises(ValueError, match=name):
             OnlineDTFM.load(file, make_venv(), dataset=cheetah_buffer, **{name: wrong})
 
