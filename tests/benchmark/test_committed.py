@@ -9,7 +9,7 @@ from sb3_dtfm.cli.main import main
 ROOT = Path(__file__).parents[2]
 # Where a report lies, and of what it is; results/README.md has the commands.
 STUDIES = ("time-steps", "windows/*_uniform-windows.jsonl", "paused", "mixed", "few", "noisy", "two-ways", "styles")
-REPORTS = {"docs": ("small",), "docs/studies": STUDIES}
+REPORTS = {"docs": ("grid/*_small.jsonl",), "docs/studies": STUDIES}
 
 
 def tables(text: str) -> list[str]:
