@@ -5,29 +5,28 @@ What fine-tuning stands beside: SAC from scratch, and SAC with the recorded epis
         --eval-freq 30000 --output results/finetuning [--with-data]
 
 `--like` is a cell of the model that is fine-tuned: its rows tell task, data and seed. Stable-Baselines3's SAC at its own
-settings, in ten environments, with a gradient step for each step of one. The initial states of the evaluations are those of
-`sb3-dtfm benchmark`, and the rows' steps the environments'.
+settings, in ten environments, with a gradient step for each step of one. Evaluations are those of `sb3-dtfm benchmark`, and
+the rows' steps the environments'; both numbers of steps have to be multiples of ten. A run that is killed leaves no rows.
 """
 
 import argparse
-import time
 from pathlib import Path
 
 import numpy as np
 import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_dtfm.benchmark import provenance
-from sb3_dtfm.benchmark.evaluation import FINAL_STATES, TRAINING_STATES, evaluate, make_seeded_envs
-from sb3_dtfm.benchmark.rows import Cell, Row, read_rows, write_row
+from sb3_dtfm.benchmark.evaluation import EvaluationCallback
+from sb3_dtfm.benchmark.rows import Cell, read_rows
 from sb3_dtfm.data import TrajectoryBuffer, load_dataset
+from sb3_dtfm.files import replacing
 
 N_ENVS = 10
 N_FINAL_EPISODES = 100
 SETTINGS = dict(gradient_steps=-1, learning_starts=1000)
+OF_THE_DATA = ("dataset", "dataset_fraction", "dataset_seed", "dataset_kwargs")
 
 
 def fill(replay: ReplayBuffer, recorded: TrajectoryBuffer, agent: SAC) -> int:
@@ -42,61 +41,17 @@ def fill(replay: ReplayBuffer, recorded: TrajectoryBuffer, agent: SAC) -> int:
     observations, actions, rewards = (
         getattr(recorded, name)[recorded.rows].numpy() for name in ("observations", "actions", "rewards")
     )
-    stops = np.cumsum(recorded.episode_lengths) - 1
-    done = np.zeros(len(recorded), bool)
-    done[stops] = recorded.terminated
-    known = np.flatnonzero(~np.isin(np.arange(len(recorded)), stops[~recorded.terminated]))
-    following = np.where(done, np.arange(len(recorded)), np.minimum(np.arange(len(recorded)) + 1, len(recorded) - 1))
     actions = agent.policy.scale_action(actions)
-    n_rows = len(known) // replay.n_envs
-    for steps in known[: n_rows * replay.n_envs].reshape(n_rows, replay.n_envs):
+    following = np.roll(observations, -1, axis=0)  # behind a terminated episode's last step nobody looks at it
+    lasts = np.cumsum(recorded.episode_lengths) - 1
+    done = np.zeros(len(recorded), bool)
+    done[lasts] = recorded.terminated
+    known = np.setdiff1d(np.arange(len(recorded)), lasts[~recorded.terminated])
+    known = known[: len(known) - len(known) % replay.n_envs]
+    for steps in known.reshape(-1, replay.n_envs):
         infos = [{} for _ in steps]
-        replay.add(observations[steps], observations[following[steps]], actions[steps], rewards[steps], done[steps], infos)
-    return n_rows * replay.n_envs
-
-
-class Evaluate(BaseCallback):
-    """
-    Write a row before the first step, every `eval_freq` steps, and a final one.
-
-    :param file: to append to
-    :param row: what all rows say
-    :param envs: to act in
-    :param eval_freq: environment steps between two evaluations
-    :param n_episodes: of each but the final one
-    """
-
-    def __init__(self, file: Path, row: Row, envs: VecEnv, eval_freq: int, n_episodes: int) -> None:
-        super().__init__()
-        self.file, self.row, self.envs, self.eval_freq, self.n_episodes = file, row, envs, eval_freq, n_episodes
-        self.seconds, self.resumed = 0.0, 0.0
-
-    def _on_training_start(self) -> None:
-        self.resumed = time.perf_counter()
-        self.evaluate(final=False)
-
-    def _on_step(self) -> bool:
-        if self.num_timesteps % self.eval_freq < self.training_env.num_envs:
-            self.evaluate(final=False)
-        return True
-
-    def _on_training_end(self) -> None:
-        self.evaluate(final=True)
-
-    def evaluate(self, final: bool) -> None:
-        """
-        :param final: of the states that nobody could choose a model by
-        """
-        self.seconds += time.perf_counter() - self.resumed
-        first, n_episodes = (FINAL_STATES, N_FINAL_EPISODES) if final else (TRAINING_STATES, self.n_episodes)
-        episodes = evaluate(self.model, self.envs, range(first, first + n_episodes))
-        speed = {
-            "wall_s": round(self.seconds, 3),
-            "steps_per_s": round(self.num_timesteps / max(self.seconds, 1e-9), 3),
-            "hardware": provenance.hardware(self.model.device),
-        }
-        write_row(self.file, {**self.row, "step": self.num_timesteps, "final": final, **episodes._asdict(), **speed})
-        self.resumed = time.perf_counter()
+        replay.add(observations[steps], following[steps], actions[steps], rewards[steps], done[steps], infos)
+    return len(known)
 
 
 def main() -> None:
@@ -108,34 +63,31 @@ def main() -> None:
     parser.add_argument("--eval-episodes", type=int, default=20)
     parser.add_argument("--output", type=Path, required=True)
     options = parser.parse_args()
+    for name in ("n_timesteps", "eval_freq"):
+        if vars(options)[name] % N_ENVS:
+            parser.error(
+                f"{name} is {vars(options)[name]}; a multiple of {N_ENVS} is accepted, one step of each environment."
+            )
     th.set_num_threads(1)
     like = read_rows(options.like)[-1]
-    label = "sac-with-data" if options.with_data else "sac"
-    task = {key: like["settings"][key] for key in ("env_kwargs",) if key in like["settings"]}
-    data = {key: like["settings"][key] for key in ("dataset", "dataset_fraction", "dataset_seed") if key in like["settings"]}
-    envs, evaluated = (make_seeded_envs(like["task"], task, N_ENVS) for _ in range(2))
-    envs.seed(like["seed"])
+    of_the_task = {key: like["settings"][key] for key in ("env_kwargs",) if key in like["settings"]}
+    of_the_data = {key: like["settings"][key] for key in OF_THE_DATA if key in like["settings"]}
+    envs = make_vec_env(like["task"], N_ENVS, env_kwargs=of_the_task.get("env_kwargs"))
     agent = SAC("MlpPolicy", envs, seed=like["seed"], device="cpu", **SETTINGS)
     if options.with_data:
-        recorded = load_dataset(data["dataset"], **like["settings"].get("dataset_kwargs", {}))
-        recorded = recorded.random_fraction(data.get("dataset_fraction", 1.0), data.get("dataset_seed", 0))
-        print(f"{fill(agent.replay_buffer, recorded, agent)} recorded steps in the replay buffer")
+        recorded = load_dataset(of_the_data["dataset"], **of_the_data.get("dataset_kwargs", {}))
+        share = (of_the_data.get("dataset_fraction", 1.0), of_the_data.get("dataset_seed", 0))
+        print(f"{fill(agent.replay_buffer, recorded.random_fraction(*share), agent)} recorded steps in the replay buffer")
     row = {
         **{key: like[key] for key in ("task", "regime", "seed", "profile", "data")},
         "algo": "sac",
-        "label": label,
-        "solver": None,
-        "n_solver_steps": None,
-        "settings": {"n_envs": N_ENVS, **SETTINGS, **task, **(data if options.with_data else {})},
-        "commit": provenance.commit(),
-        "versions": provenance.versions(),
+        "label": "sac-with-data" if options.with_data else "sac",
+        "settings": {"n_envs": N_ENVS, **SETTINGS, **of_the_task, **(of_the_data if options.with_data else {})},
     }
     options.output.mkdir(parents=True, exist_ok=True)
-    file = options.output / f"{Cell.of(row).file_name}.jsonl"
-    file.unlink(missing_ok=True)
-    agent.learn(
-        options.n_timesteps, Evaluate(file, row, evaluated, options.eval_freq, options.eval_episodes), progress_bar=True
-    )
+    with replacing(options.output / f"{Cell.of(row).file_name}.jsonl") as rows:
+        evaluation = (options.eval_freq, options.eval_episodes, N_FINAL_EPISODES, N_ENVS)
+        agent.learn(options.n_timesteps, EvaluationCallback(str(rows), row, *evaluation))
 
 
 if __name__ == "__main__":

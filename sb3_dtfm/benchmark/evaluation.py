@@ -146,7 +146,8 @@ def action_ms(model: BaseAlgorithm, vec_env: VecEnv, seed: int) -> float:
     observations, state, starts = vec_env.reset(), None, np.ones(1, bool)
     times = []
     for _ in range(TIMED_BLOCKS * TIMED_ACTIONS):
-        first = {key: value[:1] for key, value in observations.items()}  # type: ignore[union-attr]
+        seen: Any = observations
+        first = seen[:1] if isinstance(seen, np.ndarray) else {key: value[:1] for key, value in seen.items()}
         start = time.perf_counter()
         actions, state = model.predict(first, state, starts, deterministic=True)
         times.append(time.perf_counter() - start)
@@ -228,7 +229,7 @@ class EvaluationCallback(BaseCallback):
         what = f"{'final ' if final else ''}evaluation"
         seeds = range(first, first + n_episodes)
         episodes = evaluate(self.model, self.vec_env, seeds, lambda n_done: self._report(f"{what} {n_done}/{n_episodes}"))
-        acting = self.model.policy.acting_settings()  # type: ignore[operator]
+        acting: Row = getattr(self.model.policy, "acting_settings", dict)()  # SB3's algorithms have none
         evaluation: Row = dict(
             step=self.num_timesteps,
             final=final,

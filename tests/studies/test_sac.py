@@ -3,6 +3,7 @@
 import sys
 
 import numpy as np
+import pytest
 import sac
 from gymnasium import spaces
 from stable_baselines3 import SAC
@@ -55,3 +56,7 @@ def test_a_run_is_evaluated(tmp_path, monkeypatch):
         (40, True, 4),
     ]
     assert {(row["algo"], row["seed"], row["label"]) for row in rows} == {("sac", 3, "sac")}
+    monkeypatch.setattr(sys, "argv", ["sac.py", *arguments, "--output", str(tmp_path / "rows"), "-n", "45"])
+    with pytest.raises(SystemExit):
+        sac.main()
+    assert len(read_rows(file)) == 4
