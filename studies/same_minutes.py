@@ -4,7 +4,8 @@ What a study's runs had reached when those of another one, which need fewer minu
     python studies/same_minutes.py results/one-token results/small --labels one-token ""
 
 A line for each task and algorithm: the means over the last three evaluations that were made within these minutes of
-training, seed by seed. The longer runs are cut short, so their learning rate had not come down yet.
+training, seed by seed. The longer runs are cut short, so their learning rate had not come down yet. Other jobs can only make a
+run slower: the steps take as long as in a cell's quickest run.
 """
 
 import argparse
@@ -23,9 +24,14 @@ def runs_of(folder: Path, label: str) -> dict[tuple, list[Run]]:
     return {cell: runs for group in groups for cell, runs in group.runs.items()}
 
 
-def reached(run: Run, minutes: float) -> str:
-    """Return, or success in percent, by then."""
-    rows = [row for row in run.evaluations if row["wall_s"] <= 60 * minutes][-N_LAST:]
+def minutes_a_step(runs: list[Run]) -> float:
+    """Of the quickest run."""
+    return min(run.minutes / run.final["step"] for run in runs)
+
+
+def reached(run: Run, n_steps: float) -> str:
+    """Return, or success in percent, after so many gradient steps."""
+    rows = [row for row in run.evaluations if row["step"] <= n_steps][-N_LAST:]
     if run.counts_success:
         return f"{np.mean([row['successes'] for row in rows]):.0%}"
     return f"{np.mean([row['returns'] for row in rows]):,.0f}"
@@ -40,9 +46,10 @@ def main() -> None:
     print("| task | data | algorithm | minutes | whole, seed by seed | cut short |\n| --- | --- | --- | --- | --- | --- |")
     for cell in sorted(quick.keys() & slow.keys()):
         task, share, algo = cell
-        minutes = float(np.mean([run.minutes for run in quick[cell]]))
+        minutes = minutes_a_step(quick[cell]) * quick[cell][0].final["step"]
+        n_steps = minutes / minutes_a_step(slow[cell])
         whole, cut = (
-            "; ".join(reached(run, limit) for run in runs) for runs, limit in ((quick[cell], np.inf), (slow[cell], minutes))
+            "; ".join(reached(run, limit) for run in runs) for runs, limit in ((quick[cell], np.inf), (slow[cell], n_steps))
         )
         print(f"| {task} | {share:.0%} | {algo.upper()} | {minutes:.1f} | {whole} | {cut} |")
 

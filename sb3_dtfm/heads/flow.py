@@ -62,7 +62,8 @@ class FlowHead(ActionHead):
     regression, and what noise and time have to add to it is learned.
 
     With `one_step` a second network learns where the flow ends, so that an action can take one evaluation instead of one per
-    solver step. It learns from the field and gives nothing back: trunk and field are what they are without it.
+    solver step. It learns from the field and gives nothing back: trunk and field are what they are without it. Where the field
+    predicts actions, it adds to the same W h + b what noise changes, and starts at zero too; else to the noise.
 
     :param embed_dim: D
     :param action_dim: A
@@ -103,10 +104,12 @@ class FlowHead(ActionHead):
         sizes = (action_dim, embed_dim, flow_hidden_dim, flow_n_layers)
         self.vector_field = VectorField(*sizes)
         self.regression = Linear(embed_dim, action_dim) if flow_prediction == "action" else None
-        if self.regression is not None:
-            nn.init.zeros_(self.vector_field.output.weight)
-            nn.init.zeros_(self.vector_field.output.bias)
         self.one_step = FilmNetwork(*sizes) if one_step else None
+        if self.regression is not None:
+            for network in (self.vector_field, self.one_step):
+                if network is not None:
+                    nn.init.zeros_(network.output.weight)
+                    nn.init.zeros_(network.output.bias)
         self.auxiliary = RegressionHead(embed_dim, action_dim) if regression_coef > 0 else None
         acting = self.check_acting(solver=solver, n_solver_steps=n_solver_steps)
         self.solver: str = acting["solver"]
@@ -181,9 +184,10 @@ class FlowHead(ActionHead):
         return self.solve(hidden, noise, self.solver, self.n_solver_steps)
 
     def one_step_action(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
-        """From noise (..., A) to actions (..., A) in one step."""
+        """From noise (..., A) to actions (..., A) in one step. No gradient flows into the field's W h + b."""
         assert self.one_step is not None
-        return noise + self.one_step(noise, self.one_step.film_condition(hidden))
+        change = self.one_step(noise, self.one_step.film_condition(hidden))
+        return noise + change if self.regression is None else (self.regression(hidden).detach() + change).tanh()
 
     def solve(self, hidden: th.Tensor, noise: th.Tensor, solver: str, n_solver_steps: int) -> th.Tensor:
         """

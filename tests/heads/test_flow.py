@@ -106,6 +106,16 @@ def test_a_head_that_predicts_actions_starts_as_decision_transformers():
     th.testing.assert_close(head.solve(hidden, noise, "euler", 3), regression(hidden))
 
 
+def test_its_one_step_network_starts_so_too_and_leaves_the_regression_alone():
+    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_prediction="action")
+    hidden, noise = th.randn(3, 4), th.randn(3, 2)
+    th.testing.assert_close(head.one_step_action(hidden, noise), head.solve(hidden, noise, "euler", 1))
+    nn.init.normal_(head.vector_field.output.weight)
+    head.one_step_loss(hidden, th.ones(3, dtype=th.bool), noise).backward()
+    moved = {name for name, parameter in head.named_parameters() if parameter.grad is not None}
+    assert moved == {name for name, _ in head.named_parameters() if name.startswith("one_step.")}
+
+
 def test_parts_of_the_loss_add_up():
     """Flow, auxiliary regression by its weight, and the one-step network."""
     head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, regression_coef=0.5)
