@@ -1,10 +1,10 @@
 """
-How many gradient steps a second two processes of one thread make beside one process of two threads.
+How many gradient steps a second one process makes with a thread and with two, and two processes with a thread each.
 
     python studies/processes.py --dataset local/halfcheetah/expert-v0
 
-By `sb3-dtfm train`, in turn, both with 64 windows a step: the small profile of HalfCheetah, and a trunk of 10 layers of 256 with
-a head of 512 and a context of 20. Prints a row for each size: the rates of all rounds.
+By `sb3-dtfm train`, in turn, all with 64 windows a step: the small profile of HalfCheetah, and the paper's trunk and head.
+Prints a row for each size: the rates of all rounds. Where `OMP_NUM_THREADS` is not set, `learn` chooses the threads itself.
 """
 
 import argparse
@@ -16,15 +16,23 @@ import tempfile
 
 N_ROUNDS = 3
 RATE = re.compile(r"steps_per_second\s*\|\s*([\d.]+)")
-LARGE = "policy_kwargs:dict(embed_dim=256,n_layers=10,flow_hidden_dim=512)"
+TRAINING = ["train", "--algo", "dtfm", "--env", "HalfCheetah-v5", "--conf-file", "small", "--eval-freq", "-1"]
 # Of each size, the gradient steps of a run and what `sb3-dtfm train` is told beside them.
 SIZES = {
-    "small profile": (1000, []),
-    "width 256, context 20": (60, ["-params", "context_length:20", LARGE]),
+    "small profile": (600, []),
+    "paper's size": (
+        30,
+        ["-params", "context_length:20", "policy_kwargs:dict(embed_dim=256, n_layers=10, flow_hidden_dim=512)"],
+    ),
 }
+ONE = ["-m", "sb3_dtfm"]
+TWO = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", *ONE]
+# Of each way, `OMP_NUM_THREADS` and how Python is started.
 WAYS = {
-    "one process of two threads": ("2", ["-m", "sb3_dtfm"]),
-    "two processes of one thread": ("1", ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "sb3_dtfm"]),
+    "one process, one thread": ("1", ONE),
+    "one process, two threads": ("2", ONE),
+    "one process, as it chooses": (None, ONE),
+    "two processes, one thread each": ("1", TWO),
 }
 
 
@@ -38,11 +46,12 @@ def rate(way: str, size: str, dataset: str) -> float:
     """
     n_threads, start = WAYS[way]
     n_steps, settings = SIZES[size]
-    training = ["train", "--algo", "dtfm", "--env", "HalfCheetah-v5", "--conf-file", "small", "--dataset", dataset]
-    training += ["-n", str(n_steps), "--log-interval", str(n_steps // 2), "--eval-freq", "-1", *settings]
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
+    if n_threads is not None:
+        environment["OMP_NUM_THREADS"] = n_threads
+    steps = ["-n", str(n_steps), "--log-interval", str(n_steps // 2)]
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, *start, *training, "-f", folder]
-        environment = {**os.environ, "OMP_NUM_THREADS": n_threads}
+        command = [sys.executable, *start, *TRAINING, *steps, "--dataset", dataset, *settings, "-f", folder]
         output = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True).stdout
     return float(RATE.findall(output)[-1])
 
@@ -51,7 +60,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--dataset", required=True)
     dataset = parser.parse_args().dataset
-    print(f"| steps a second | {' | '.join(WAYS)} |\n| --- | --- | --- |")
+    print(f"| steps a second | {' | '.join(WAYS)} |\n| {' | '.join(['---'] * (1 + len(WAYS)))} |")
     for size in SIZES:
         rounds = [[rate(way, size, dataset) for way in WAYS] for _ in range(N_ROUNDS)]
         rates = ("; ".join(f"{value:.1f}" for value in values) for values in zip(*rounds, strict=True))

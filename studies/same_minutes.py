@@ -4,8 +4,8 @@ What a study's runs had reached when those of another one, which need fewer minu
     python studies/same_minutes.py results/one-token results/small --labels one-token ""
 
 A line for each task and algorithm: the means over the last three evaluations that were made within these minutes of
-training, seed by seed. The longer runs are cut short, so their learning rate had not come down yet. Other jobs can only make a
-run slower: the steps take as long as in a cell's quickest run.
+training, seed by seed. The longer runs are cut short, so their learning rate had not come down yet. Other jobs can only make
+a run slower: the steps take as long as in a cell's quickest run.
 """
 
 import argparse

@@ -18,6 +18,7 @@ from sb3_dtfm.arguments import POSITIVE
 from sb3_dtfm.callbacks import GradientStepProgressBar, NormalizedScoreCallback, find_eval_callbacks
 from sb3_dtfm.data import TrajectoryBuffer
 from sb3_dtfm.distributed import DataParallel, LossFunction, is_first_process
+from sb3_dtfm.networks.cpu import n_weights, threads_that_pay
 from sb3_dtfm.optimization import (
     BATCHES,
     DROPOUT,
@@ -163,10 +164,16 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         start = time.perf_counter()
         generator = th.Generator(self.device).manual_seed(step_seed(self._training_seed, self._n_updates, NOISE))
         seed_default_generator(self.device, step_seed(self._training_seed, self._n_updates, DROPOUT, parallel.rank))
-        with self._memory_errors_named():
+        with self._memory_errors_named(), threads_that_pay(self._n_products()):
             self._gradient_step(next(batches), generator, parallel)
         self._training_seconds += time.perf_counter() - start
         self._timed_steps += 1
+
+    def _n_products(self) -> int:
+        """Multiplications of a gradient step, forward and twice as many backward, without attention's."""
+        trunk, head = self.policy.network.trunk, self.policy.network.head
+        a_step = trunk.tokens_per_step * n_weights(trunk) + n_weights(head)
+        return 3 * self.batch_size * self.context_length * a_step
 
     def _loss_function(self) -> LossFunction:
         """The policy's loss in the precision asked for, compiled where that pays."""

@@ -18,8 +18,8 @@ from sb3_dtfm.networks.solvers import SOLVERS, integrate, solver_times
 
 # Not an ODE solver: a network of its own that has learnt where the solver would end.
 ONE_STEP = "one_step"
-# Solver steps whose end that network learns.
-DISTILLED_STEPS = 16
+# Of a solver of more steps, the network learns where so many end.
+MAX_DISTILLED_STEPS = 16
 # Values of tau in a window, which its steps take in turn: the share of tau in scales and shifts is computed once for each.
 TAUS_PER_WINDOW = 4
 
@@ -61,9 +61,10 @@ class FlowHead(ActionHead):
     prediction is tanh(W h + b + FiLM network), whose last term starts at zero: training starts from Decision Transformer's
     regression, and what noise and time have to add to it is learned.
 
-    With `one_step` a second network learns where the flow ends, so that an action can take one evaluation instead of one per
-    solver step. It learns from the field and gives nothing back: trunk and field are what they are without it. Where the field
-    predicts actions, it adds to the same W h + b what noise changes, and starts at zero too; else to the noise.
+    With `one_step` a second network learns where `n_solver_steps` of Euler end, 16 at most, so that an action can take one
+    evaluation instead of one per solver step. It learns from the field and gives nothing back: trunk and field are what they
+    are without it. Where the field predicts actions, this network adds to the same W h + b, and starts at zero too; else it
+    adds to the noise.
 
     :param embed_dim: D
     :param action_dim: A
@@ -114,6 +115,7 @@ class FlowHead(ActionHead):
         acting = self.check_acting(solver=solver, n_solver_steps=n_solver_steps)
         self.solver: str = acting["solver"]
         self.n_solver_steps: int = acting["n_solver_steps"]
+        self.n_distilled_steps = min(n_solver_steps, MAX_DISTILLED_STEPS)  # however it acts later
 
     def check_acting(self, **choices: Any) -> dict[str, Any]:
         choices = check_arguments(choices, ACTING)
@@ -175,7 +177,7 @@ class FlowHead(ActionHead):
         """
         hidden = hidden.detach()
         with th.no_grad():
-            target = self.solve(hidden, noise, "euler", DISTILLED_STEPS).clamp(-1.0, 1.0)
+            target = self.solve(hidden, noise, "euler", self.n_distilled_steps).clamp(-1.0, 1.0)
         return masked_mean((self.one_step_action(hidden, noise) - target).square(), mask)
 
     def forward(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:

@@ -116,6 +116,16 @@ def test_its_one_step_network_starts_so_too_and_leaves_the_regression_alone():
     assert moved == {name for name, _ in head.named_parameters() if name.startswith("one_step.")}
 
 
+@pytest.mark.parametrize(("n_solver_steps", "expected"), [(3, 3), (50, 16)])
+def test_the_one_step_network_learns_where_the_solver_of_the_settings_ends(n_solver_steps, expected):
+    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, n_solver_steps=n_solver_steps)
+    head.n_solver_steps = 1  # as it acts later changes nothing
+    hidden, noise = th.randn(3, 4), th.randn(3, 2)
+    error = head.one_step_action(hidden, noise) - head.solve(hidden, noise, "euler", expected).clamp(-1.0, 1.0)
+    loss = head.one_step_loss(hidden, th.ones(3, dtype=th.bool), noise)
+    th.testing.assert_close(loss, error.square().mean())
+
+
 def test_parts_of_the_loss_add_up():
     """Flow, auxiliary regression by its weight, and the one-step network."""
     head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, regression_coef=0.5)
