@@ -1,12 +1,17 @@
-"""Small parts of the learn loop: learning rate, precision, and means of what was measured."""
+"""Small parts of the learn loop: learning rate, precision, threads, and means of what was measured."""
 
+import contextlib
 import math
+import os
+from collections.abc import Iterator
 
 import numpy as np
 import torch as th
 
 LEARNING_RATE_SCHEDULES = ("constant", "linear", "cosine")
 PRECISIONS = ("auto", "float32", "bfloat16")
+# Multiplications of a gradient step up to which one thread is as quick as two, which wait for one another.
+ONE_THREADS_PRODUCTS = 3e9
 
 
 def learning_rate_factor(schedule: str, step: int, progress: float, warmup_steps: int = 0) -> float:
@@ -42,6 +47,29 @@ def autocast(precision: str, device: th.device) -> th.autocast:
     """
     use_bfloat16 = precision == "bfloat16" or (precision == "auto" and has_fast_bfloat16(device))
     return th.autocast(device.type, dtype=th.bfloat16, enabled=use_bfloat16)
+
+
+@contextlib.contextmanager
+def threads_that_pay(n_products: float) -> Iterator[None]:
+    """
+    One thread for little work; as many as ever for more, and where `OMP_NUM_THREADS` says how many.
+
+    :param n_products: multiplications of the work
+    """
+    n_threads = th.get_num_threads()
+    if n_products > ONE_THREADS_PRODUCTS or n_threads == 1 or "OMP_NUM_THREADS" in os.environ:
+        yield
+        return
+    th.set_num_threads(1)
+    try:
+        yield
+    finally:
+        th.set_num_threads(n_threads)
+
+
+def n_weights(network: th.nn.Module) -> int:
+    """Numbers in its linear layers' weights: multiplications of a token."""
+    return sum(layer.weight.numel() for layer in network.modules() if isinstance(layer, th.nn.Linear))
 
 
 class RunningMeans:

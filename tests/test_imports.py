@@ -53,7 +53,7 @@ ROOMS = {
         "sb3_dtfm/zoo",
         {"", "algorithms", "arguments", "policies", "callbacks", "envs", "distributed", "files", "finetuning", "zoo"},
     ),
-    "benchmark": ("sb3_dtfm/benchmark", {"", "algorithms", "data", "envs", "zoo", "benchmark", "files"}),
+    "benchmark": ("sb3_dtfm/benchmark", {"", "algorithms", "data", "envs", "optimization", "zoo", "benchmark", "files"}),
     "cli": (
         "sb3_dtfm/cli",
         {"", "actions", "algorithms", "data", "envs", "finetuning", "recording", "zoo", "benchmark", "files", "cli"},

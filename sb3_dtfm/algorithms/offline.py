@@ -18,7 +18,6 @@ from sb3_dtfm.arguments import POSITIVE
 from sb3_dtfm.callbacks import GradientStepProgressBar, NormalizedScoreCallback, find_eval_callbacks
 from sb3_dtfm.data import TrajectoryBuffer
 from sb3_dtfm.distributed import DataParallel, LossFunction, is_first_process
-from sb3_dtfm.networks.cpu import n_weights, threads_that_pay
 from sb3_dtfm.optimization import (
     BATCHES,
     DROPOUT,
@@ -27,8 +26,10 @@ from sb3_dtfm.optimization import (
     RunningMeans,
     autocast,
     learning_rate_factor,
+    n_weights,
     seed_default_generator,
     step_seed,
+    threads_that_pay,
 )
 from sb3_dtfm.windows import Transitions, Windows
 

@@ -17,6 +17,7 @@ import torch as th
 import sb3_dtfm
 from sb3_dtfm.data import load_dataset
 from sb3_dtfm.data.minari import is_minari, open_minari
+from sb3_dtfm.optimization import has_fast_bfloat16
 
 PACKAGES = ("sb3-dtfm", "torch", "stable-baselines3", "rl_zoo3", "gymnasium", "mujoco", "robosuite", "numpy")
 GIT_TIMEOUT = 20  # seconds
@@ -56,6 +57,7 @@ def hardware(device: th.device) -> dict[str, Any]:
         "cpu": _cpu_name(),
         "cores": n_cores(),
         "threads": th.get_num_threads(),
+        "bfloat16": has_fast_bfloat16(device),  # what precision="auto" is there
         "gpu": th.cuda.get_device_name(device) if device.type == "cuda" else None,
     }
 

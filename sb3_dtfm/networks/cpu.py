@@ -21,8 +21,6 @@ take 21 % longer (19 MB). A dropout mask takes an eighth of torch's time.
 """
 
 import contextlib
-import os
-from collections.abc import Iterator
 
 import numpy as np
 import torch as th
@@ -37,8 +35,6 @@ FEW_ROWS = 4
 LARGE_WEIGHT = 1 << 17
 # Steps that fit behind what is kept before it moves to new memory.
 ROOM = 20
-# Multiplications of a gradient step up to which one thread is as quick as two, which wait for one another.
-ONE_THREADS_PRODUCTS = 3e9
 
 
 class Linear(nn.Linear):
@@ -68,29 +64,6 @@ class Linear(nn.Linear):
         if self.bias is not None:
             y += self.bias.detach().numpy()
         return th.from_numpy(y).view(*x.shape[:-1], self.out_features)
-
-
-@contextlib.contextmanager
-def threads_that_pay(n_products: float) -> Iterator[None]:
-    """
-    One thread for little work; as many as ever for more, and where `OMP_NUM_THREADS` says how many.
-
-    :param n_products: multiplications of the work
-    """
-    n_threads = th.get_num_threads()
-    if n_products > ONE_THREADS_PRODUCTS or n_threads == 1 or "OMP_NUM_THREADS" in os.environ:
-        yield
-        return
-    th.set_num_threads(1)
-    try:
-        yield
-    finally:
-        th.set_num_threads(n_threads)
-
-
-def n_weights(network: nn.Module) -> int:
-    """Numbers in its linear layers' weights: multiplications of a token."""
-    return sum(layer.weight.numel() for layer in network.modules() if isinstance(layer, nn.Linear))
 
 
 def keep_mask(like: th.Tensor, probability: float) -> th.Tensor:

@@ -1,0 +1,36 @@
+"""How many threads a gradient step takes."""
+
+import pytest
+import torch as th
+from torch.utils.flop_counter import FlopCounterMode
+
+from sb3_dtfm import DTFM
+from sb3_dtfm.optimization import ONE_THREADS_PRODUCTS, threads_that_pay
+
+
+@pytest.mark.parametrize(
+    ("n_products", "environment", "expected"), [(1e9, {}, 1), (1e10, {}, 2), (1e9, {"OMP_NUM_THREADS": "2"}, 2)]
+)
+def test_little_work_is_done_by_one_thread_unless_the_user_says_how_many(n_products, environment, expected, monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    before = th.get_num_threads()
+    th.set_num_threads(2)
+    try:
+        with threads_that_pay(n_products):
+            assert th.get_num_threads() == expected
+        assert th.get_num_threads() == 2
+    finally:
+        th.set_num_threads(before)
+
+
+def test_the_packaged_small_profile_is_little_work_and_the_papers_is_not(cheetah_buffer):
+    """Multiplications of a gradient step, as torch counts half of its floating-point operations."""
+    sizes = dict(embed_dim=128, n_layers=3, tokens_per_step=1, flow_hidden_dim=128, one_step=False, dropout=0.0)
+    for large, settings, context in ((False, sizes, {"context_length": 5}), (True, {}, {})):
+        model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, batch_size=64, policy_kwargs=settings, **context)
+        with FlopCounterMode(display=False) as counter:
+            model.learn(1)
+        assert model._n_products() == pytest.approx(counter.get_total_flops() / 2, rel=0.25)
+        assert (model._n_products() > ONE_THREADS_PRODUCTS) == large
