@@ -7,15 +7,18 @@ How near trained models' actions are to those of the agent that was recorded, ha
 Models are told apart by `/dt/` and `/dtfm/` in their paths, where `sb3-dtfm train` and `benchmark` put them. Prints the root
 mean square of the difference, in units of [-1, 1], at the last step of windows: of episodes learned from, and of the others;
 anywhere, and among the first steps of episodes. And the share of the recorded numbers that lie at a bound of their action.
+`-o FILE.json` also writes them down, by model, part and place.
 """
 
 import argparse
+import json
 from pathlib import Path
 
 import numpy as np
 import torch as th
 
 from sb3_dtfm.algorithms import ALGORITHMS
+from sb3_dtfm.benchmark.provenance import commit
 from sb3_dtfm.data import TrajectoryBuffer, load_dataset
 from sb3_dtfm.recording.loading import algorithm_of, load_agent
 
@@ -55,11 +58,13 @@ def main() -> None:
     parser.add_argument("--dataset", required=True)
     parser.add_argument("--fraction", type=float, default=1.0)
     parser.add_argument("--dataset-seed", type=int, default=0)
+    parser.add_argument("-o", "--output", type=Path)
     options = parser.parse_args()
     agent = load_agent(options.agent_algo, options.agent, "cpu")
     recorded = load_dataset(options.dataset)
     parts = split(recorded, options.fraction, options.dataset_seed)
     print(f"{options.dataset}: {share_at_bounds(recorded):.1%} of the recorded actions' numbers are at a bound")
+    found: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
     for path in options.models:
         policy = ALGORITHMS[algorithm_of(path)].load(path, device="cpu").policy
         for name, buffer in parts.items():
@@ -72,7 +77,13 @@ def main() -> None:
                     target = batch._replace(actions=th.cat((batch.actions[:, :-1], actions.unsqueeze(1)), dim=1))
                     errors[whose] = policy.action_mse(target, generator) ** 0.5
                 report = ", ".join(f"{error:.4f} from {whose}" for whose, error in errors.items())
-                print(f"{path}: {name}, {where}: {report}")
+                print(f"{path}: {name}, {where}: {report}", flush=True)
+                found.setdefault(str(path), {}).setdefault(name, {})[where] = {
+                    whose: round(error, 4) for whose, error in errors.items()
+                }
+    if options.output is not None:
+        about = {"dataset": options.dataset, "fraction": options.fraction, "commit": commit()}
+        options.output.write_text(json.dumps({**about, "models": found}, indent=1) + "\n")
 
 
 if __name__ == "__main__":
