@@ -391,8 +391,9 @@ class TrajectoryBuffer:
         steps["actions"] = from_vectors(steps["actions"], self.action_space)
         space = dict(zip(("action_low", "action_high"), bounds_of(self.action_space), strict=True))
         named = {} if self.env_id is None else {"env_id": np.array(self.env_id)}
-        if not np.isnan(self.successes).any():
-            named["successes"] = self.successes.astype(bool)
+        silent = np.isnan(self.successes)
+        if not silent.all():
+            named["successes"] = self.successes if silent.any() else self.successes.astype(bool)
         with replacing(path) as beside, open(beside, "wb") as file:
             np.savez(file, **steps, **ended, episode_ends=stops, **space, **named)
 

@@ -98,9 +98,10 @@ def load_flat(
     Read are `observations` (N, O), `actions` (N, A), or whole numbers (N,) of a Discrete space, and `rewards` (N,), or what
     others call them (`obs`, `state`, `action`, `reward`). Episodes end where `episode_ends` says (E,), counting steps from
     the start of the file, or after `episode_lengths` (E,) each, or at the steps of `terminals` or `timeouts` (N,). `success`
-    tells of each episode (E,), or of each step (N,), and then an episode's last one counts. Without rewards a success has a
-    reward of 1 at its last step, and where nothing tells every episode is one. Nothing in a file is ever executed: arrays
-    of Python objects are refused. The arrays are read into memory, also to write a cache of them.
+    tells of each episode (E,), NaN of one that is not known, or of each step (N,), and then an episode's last one counts.
+    Without rewards a success has a reward of 1 at its last step, and an episode of which nothing tells is one. Nothing in a
+    file is ever executed: arrays of Python objects are refused. The arrays are read into memory, also to write a cache of
+    them.
 
     :param dataset: path of the file, or arrays by name
     :param observation_keys: which arrays make up the observation, in this order, each (N, ...)
@@ -271,7 +272,7 @@ def _read(
         raise DatasetError(f"{source}: rewards have {rewards.shape[1]} columns; one number a step is expected.")
     successes = _successes(arrays, n_steps, stops)
     if not has_rewards:
-        done = stops - 1 if successes is None else stops[successes] - 1
+        done = stops[successes != 0.0] - 1
         rewards[done] = 1.0
         terminated[done] = True
     if action_bounds is None and arrays.has((LOW,)):
@@ -287,7 +288,7 @@ def _read(
             rewards=rewards[start:stop, 0],
             terminated=bool(terminated[stop - 1]),
             truncated=bool(truncated[stop - 1]),
-            success=None if successes is None else bool(successes[episode]),
+            success=None if np.isnan(successes[episode]) else bool(successes[episode]),
             name=f"episode {episode}",
         )
 
@@ -317,14 +318,16 @@ def _flags(arrays: _Arrays, names: Sequence[str], n_steps: int) -> np.ndarray:
     return check_flags(arrays.read(names), n_steps, f"{arrays.source}: {arrays.name(names)}")
 
 
-def _successes(arrays: _Arrays, n_steps: int, stops: np.ndarray) -> np.ndarray | None:
-    """(E,) bool, None where there is no such array."""
+def _successes(arrays: _Arrays, n_steps: int, stops: np.ndarray) -> np.ndarray:
+    """(E,): 1, 0, or NaN of an episode of which nothing tells."""
     if not arrays.has(SUCCESSES):
-        return None
+        return np.full(len(stops), np.nan)
     array, where = arrays.read(SUCCESSES), f"{arrays.source}: {arrays.name(SUCCESSES)}"
     if len(array) != len(stops):
-        return check_flags(array, n_steps, where)[stops - 1]
-    return check_flags(array, len(stops), where)
+        return check_flags(array, n_steps, where)[stops - 1].astype(float)
+    silent = np.isnan(array) if array.dtype.kind == "f" else np.zeros(array.shape, bool)
+    told = check_flags(np.where(silent, 0, array), len(stops), where)
+    return np.where(silent.reshape(told.shape), np.nan, told)
 
 
 def _stops(arrays: _Arrays, n_steps: int, ended: np.ndarray) -> np.ndarray:

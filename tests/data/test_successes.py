@@ -113,6 +113,9 @@ def test_what_is_saved_tells_as_much(tmp_path):
     assert load_dataset(tmp_path / "told.npz").successes.tolist() == SUCCESSES
     load_dataset(arrays()).save(tmp_path / "silent")
     assert np.isnan(load_dataset(tmp_path / "silent.npz").successes).all()
+    some = [SUCCESSES[0], np.nan, *SUCCESSES[2:]]
+    load_dataset(arrays(success=np.array(some))).save(tmp_path / "some")
+    np.testing.assert_array_equal(load_dataset(tmp_path / "some.npz").successes, some)
 
 
 def test_robomimic_files_tell(tmp_path):
