@@ -79,7 +79,7 @@ def main() -> None:
                 report = ", ".join(f"{error:.4f} from {whose}" for whose, error in errors.items())
                 print(f"{path}: {name}, {where}: {report}", flush=True)
                 found.setdefault(str(path), {}).setdefault(name, {})[where] = {
-                    whose: round(error, 4) for whose, error in errors.items()
+                    whose: round(float(error), 4) for whose, error in errors.items()
                 }
     if options.output is not None:
         about = {"dataset": options.dataset, "fraction": options.fraction, "commit": commit()}
