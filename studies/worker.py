@@ -2,7 +2,8 @@
 Measure DT or DTFM; run by `compare.py`, each measurement in a process of its own.
 
 `python worker.py train MODEL N` or `python worker.py act MODEL N SOLVER SOLVER_STEPS KV_CACHE N_ENVS FIRST` prints one line
-of JSON; MODEL is ALGO WIDTH LAYERS FLOW_HIDDEN_DIM TOKENS_PER_STEP.
+of JSON; MODEL is ALGO WIDTH LAYERS FLOW_HIDDEN_DIM TOKENS_PER_STEP. `python worker.py profile MODEL N` prints the share of the
+processor's time that each of torch's operations takes in as many steps of training, in float32.
 """
 
 import json
@@ -21,6 +22,7 @@ from sb3_dtfm.algorithms import ALGORITHMS, OfflineSequenceAlgorithm
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 
 OBSERVATION_DIM, ACTION_DIM, BATCH_SIZE, CONTEXT_LENGTH = 17, 6, 64, 20
+N_OPERATIONS = 16
 
 
 def make_model(
@@ -30,6 +32,7 @@ def make_model(
     flow_hidden_dim: int,
     tokens_per_step: int,
     context_length: int = CONTEXT_LENGTH,
+    precision: str = "auto",
     **policy_kwargs: object,
 ) -> OfflineSequenceAlgorithm:
     """DT or DTFM at its defaults but for the size and what is given."""
@@ -46,6 +49,7 @@ def make_model(
         dataset=dataset,
         batch_size=BATCH_SIZE,
         context_length=context_length,
+        precision=precision,
         policy_kwargs={**sizes, **head, **policy_kwargs},
         device="cpu",
         seed=0,
@@ -82,6 +86,16 @@ def act(model: OfflineSequenceAlgorithm, n: int, n_envs: int, first: int) -> dic
     return {"wall_ms": statistics.median(times[CONTEXT_LENGTH:]) * 1e3}
 
 
+def profile(model: OfflineSequenceAlgorithm, n_steps: int) -> dict[str, float]:
+    """Shares of the processor's time in percent, the largest first, what torch itself does not see left out."""
+    model.learn(2, log_interval=None)
+    with th.profiler.profile(activities=[th.profiler.ProfilerActivity.CPU]) as recorded:
+        model.learn(n_steps, log_interval=None)
+    times = {event.key: event.self_cpu_time_total for event in recorded.key_averages()}
+    shares = {name: round(100 * time / sum(times.values()), 1) for name, time in times.items()}
+    return dict(sorted(shares.items(), key=lambda item: -item[1])[:N_OPERATIONS])
+
+
 def median_ms(function: Callable[[], object], n: int) -> float:
     """Median time of a call in milliseconds."""
     times = []
@@ -97,6 +111,8 @@ def main() -> None:
     *sizes, n = map(int, numbers)
     if what == "train":
         result = train(make_model(algo, *sizes), n)
+    elif what == "profile":
+        result = profile(make_model(algo, *sizes, precision="float32"), n)
     else:
         solver, n_solver_steps, kv_cache, n_envs, first = sys.argv[8], *map(int, sys.argv[9:13])
         ways = dict(solver=solver, n_solver_steps=n_solver_steps, kv_cache=bool(kv_cache))
