@@ -67,11 +67,6 @@ def threads_that_pay(n_products: float) -> Iterator[None]:
         th.set_num_threads(n_threads)
 
 
-def n_weights(network: th.nn.Module) -> int:
-    """Numbers in its linear layers' weights: multiplications of a token."""
-    return sum(layer.weight.numel() for layer in network.modules() if isinstance(layer, th.nn.Linear))
-
-
 class RunningMeans:
     """
     Means of scalars, summed on their device: reading each value would wait for it.

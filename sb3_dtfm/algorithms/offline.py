@@ -26,7 +26,6 @@ from sb3_dtfm.optimization import (
     RunningMeans,
     autocast,
     learning_rate_factor,
-    n_weights,
     seed_default_generator,
     step_seed,
     threads_that_pay,
@@ -172,9 +171,7 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
 
     def _n_products(self) -> int:
         """Multiplications of a gradient step, forward and twice as many backward, without attention's."""
-        trunk, head = self.policy.network.trunk, self.policy.network.head
-        a_step = trunk.tokens_per_step * n_weights(trunk) + n_weights(head)
-        return 3 * self.batch_size * self.context_length * a_step
+        return 3 * self.batch_size * self.context_length * self.policy.network.n_products
 
     def _loss_function(self) -> LossFunction:
         """The policy's loss in the precision asked for, compiled where that pays."""

@@ -71,12 +71,17 @@ FROM_ALGORITHM = ("context_length", "max_timestep", "weight_decay", "ema", "seed
 
 
 class SequenceNetwork(nn.Module):
-    """Everything that is trained."""
+    """
+    Everything that is trained.
+
+    :ivar n_products: multiplications of a step of a window on the way forward, without attention's
+    """
 
     def __init__(self, trunk: SequenceTrunk, head: ActionHead) -> None:
         super().__init__()
         self.trunk = trunk
         self.head = head
+        self.n_products = trunk.tokens_per_step * _n_weights(trunk) + _n_weights(head)
 
 
 class SequencePolicy(BasePolicy):
@@ -732,6 +737,11 @@ class SequencePolicy(BasePolicy):
             lr_schedule=self._dummy_schedule,  # not needed to act
         )
         return {**spaces_and_schedule, **self._constructor_arguments, **self.acting_settings()}
+
+
+def _n_weights(network: nn.Module) -> int:
+    """Numbers in its linear layers' weights."""
+    return sum(layer.weight.numel() for layer in network.modules() if isinstance(layer, nn.Linear))
 
 
 def _own_parameters() -> set[str]:
