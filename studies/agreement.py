@@ -1,8 +1,10 @@
 """
-How near trained models' actions are to those of the agent that was recorded, had it not drawn them at random.
+How near trained models' actions are to the recorded ones, and to those of the agent that was recorded, had it not drawn them
+at random.
 
     python studies/agreement.py Walker2d-v5.zip ... --agent ppo-Walker2d-v5.zip --agent-algo ppo \\
         --dataset local/walker2d/expert-v0 --fraction 0.5
+    python studies/agreement.py Can-v0.zip ... --dataset datasets/can.hdf5 --fraction 0.5
 
 Models are told apart by `/dt/` and `/dtfm/` in their paths, where `sb3-dtfm train` and `benchmark` put them. Prints the root
 mean square of the difference, in units of [-1, 1], at the last step of windows: of episodes learned from, and of the others;
@@ -53,14 +55,16 @@ def share_at_bounds(buffer: TrajectoryBuffer) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", nargs="+", type=Path)
-    parser.add_argument("--agent", required=True)
-    parser.add_argument("--agent-algo", required=True)
+    parser.add_argument("--agent", help="the recorded agent; without one, only the recorded actions are compared with")
+    parser.add_argument("--agent-algo")
     parser.add_argument("--dataset", required=True)
     parser.add_argument("--fraction", type=float, default=1.0)
     parser.add_argument("--dataset-seed", type=int, default=0)
     parser.add_argument("-o", "--output", type=Path)
     options = parser.parse_args()
-    agent = load_agent(options.agent_algo, options.agent, "cpu")
+    if (options.agent is None) != (options.agent_algo is None):
+        parser.error("--agent and --agent-algo belong together")
+    agent = None if options.agent is None else load_agent(options.agent_algo, options.agent, "cpu")
     recorded = load_dataset(options.dataset)
     parts = split(recorded, options.fraction, options.dataset_seed)
     print(f"{options.dataset}: {share_at_bounds(recorded):.1%} of the recorded actions' numbers are at a bound")
@@ -70,10 +74,14 @@ def main() -> None:
         for name, buffer in parts.items():
             for where, ends in window_ends(buffer).items():
                 batch = buffer.windows(ends, policy.context_length)
-                wanted, _ = agent.predict(batch.observations[:, -1].numpy(), deterministic=True)
+                targets = {}
+                if agent is not None:
+                    wanted, _ = agent.predict(batch.observations[:, -1].numpy(), deterministic=True)
+                    targets["the agent's"] = th.as_tensor(wanted)
+                targets["the recorded"] = batch.actions[:, -1]
                 generator = th.Generator().manual_seed(0)
                 errors = {}
-                for whose, actions in (("the agent's", th.as_tensor(wanted)), ("the recorded", batch.actions[:, -1])):
+                for whose, actions in targets.items():
                     target = batch._replace(actions=th.cat((batch.actions[:, :-1], actions.unsqueeze(1)), dim=1))
                     errors[whose] = policy.action_mse(target, generator) ** 0.5
                 report = ", ".join(f"{error:.4f} from {whose}" for whose, error in errors.items())

@@ -6,6 +6,7 @@ of JSON; MODEL is ALGO WIDTH LAYERS FLOW_HIDDEN_DIM TOKENS_PER_STEP. `python wor
 the processor's time that each of torch's operations takes in as many steps of training, in float32.
 """
 
+import functools
 import json
 import resource
 import statistics
@@ -86,13 +87,16 @@ def act(model: OfflineSequenceAlgorithm, n: int, n_envs: int, first: int) -> dic
     return {"wall_ms": statistics.median(times[CONTEXT_LENGTH:]) * 1e3}
 
 
-def profile(model: OfflineSequenceAlgorithm, n_steps: int) -> dict[str, float]:
-    """Shares of the processor's time in percent, the largest first, what torch itself does not see left out."""
-    model.learn(2, log_interval=None)
+def profile(work: Callable[[], object]) -> dict[str, float]:
+    """Shares of the time in percent, the largest first; `outside`: Python, between torch's operations."""
+    work()
     with th.profiler.profile(activities=[th.profiler.ProfilerActivity.CPU]) as recorded:
-        model.learn(n_steps, log_interval=None)
+        start = time.perf_counter()
+        work()
+        took = (time.perf_counter() - start) * 1e6
     times = {event.key: event.self_cpu_time_total for event in recorded.key_averages()}
-    shares = {name: round(100 * time / sum(times.values()), 1) for name, time in times.items()}
+    times["outside"] = took - sum(times.values())
+    shares = {name: round(100 * time / took, 1) for name, time in times.items()}
     return dict(sorted(shares.items(), key=lambda item: -item[1])[:N_OPERATIONS])
 
 
@@ -107,16 +111,19 @@ def median_ms(function: Callable[[], object], n: int) -> float:
 
 
 def main() -> None:
-    what, algo, *numbers = sys.argv[1:8]
-    *sizes, n = map(int, numbers)
+    arguments = sys.argv[1:]
+    profiled = arguments[0] == "profile"
+    what, algo, *numbers = arguments[profiled:]
+    *sizes, n = map(int, numbers[:5])
     if what == "train":
-        result = train(make_model(algo, *sizes), n)
-    elif what == "profile":
-        result = profile(make_model(algo, *sizes, precision="float32"), n)
+        model = make_model(algo, *sizes, **(dict(precision="float32") if profiled else {}))
+        work = functools.partial(train, model, n)
     else:
-        solver, n_solver_steps, kv_cache, n_envs, first = sys.argv[8], *map(int, sys.argv[9:13])
+        solver, n_solver_steps, kv_cache, n_envs, first = numbers[5], *map(int, numbers[6:])
         ways = dict(solver=solver, n_solver_steps=n_solver_steps, kv_cache=bool(kv_cache))
-        result = act(make_model(algo, *sizes, **ways), n, n_envs, first)
+        model = make_model(algo, *sizes, **ways)
+        work = functools.partial(act, model, n, n_envs, first)
+    result = profile(work) if profiled else work()
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(json.dumps({**result, "peak_mib": peak, "version": sb3_dtfm.__version__, "torch": th.__version__}))
 

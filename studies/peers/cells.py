@@ -65,7 +65,7 @@ class Data(NamedTuple):
     def settings(self) -> dict[str, Any]:
         """What our own runs are told of data and environment."""
         found = self._our_settings()
-        names = ("dataset", "dataset_kwargs", "dataset_fraction", "dataset_seed", "env_wrapper")
+        names = ("dataset", "dataset_kwargs", "dataset_fraction", "dataset_seed", "env_wrapper", "env_kwargs")
         return {name: found[name] for name in names if name in found}
 
     def _our_settings(self) -> dict[str, Any]:
