@@ -6,8 +6,10 @@ of JSON; MODEL is ALGO WIDTH LAYERS FLOW_HIDDEN_DIM TOKENS_PER_STEP. `python wor
 the processor's time that each of torch's operations takes in as many steps of training, in float32.
 """
 
+import cProfile
 import functools
 import json
+import pstats
 import resource
 import statistics
 import sys
@@ -23,7 +25,7 @@ from sb3_dtfm.algorithms import ALGORITHMS, OfflineSequenceAlgorithm
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 
 OBSERVATION_DIM, ACTION_DIM, BATCH_SIZE, CONTEXT_LENGTH = 17, 6, 64, 20
-N_OPERATIONS = 16
+N_SHARES = 20
 
 
 def make_model(
@@ -87,17 +89,24 @@ def act(model: OfflineSequenceAlgorithm, n: int, n_envs: int, first: int) -> dic
     return {"wall_ms": statistics.median(times[CONTEXT_LENGTH:]) * 1e3}
 
 
-def profile(work: Callable[[], object]) -> dict[str, float]:
-    """Shares of the time in percent, the largest first; `outside`: Python, between torch's operations."""
-    work()
+def operations(work: Callable[[], object]) -> dict[str, float]:
+    """What torch's operations take, in any unit."""
     with th.profiler.profile(activities=[th.profiler.ProfilerActivity.CPU]) as recorded:
-        start = time.perf_counter()
         work()
-        took = (time.perf_counter() - start) * 1e6
-    times = {event.key: event.self_cpu_time_total for event in recorded.key_averages()}
-    times["outside"] = took - sum(times.values())
-    shares = {name: round(100 * time / took, 1) for name, time in times.items()}
-    return dict(sorted(shares.items(), key=lambda item: -item[1])[:N_OPERATIONS])
+    return {event.key: event.self_cpu_time_total for event in recorded.key_averages()}
+
+
+def calls(work: Callable[[], object]) -> dict[str, float]:
+    """What functions take by themselves, those of Python and of its libraries."""
+    with cProfile.Profile() as recorded:
+        work()
+    return {name: values[2] for (_, _, name), values in pstats.Stats(recorded).stats.items()}  # type: ignore[attr-defined]
+
+
+def shares(times: dict[str, float]) -> dict[str, float]:
+    """In percent, the largest first."""
+    found = {name: round(100 * time / sum(times.values()), 1) for name, time in times.items()}
+    return dict(sorted(found.items(), key=lambda item: -item[1])[:N_SHARES])
 
 
 def median_ms(function: Callable[[], object], n: int) -> float:
@@ -123,7 +132,8 @@ def main() -> None:
         ways = dict(solver=solver, n_solver_steps=n_solver_steps, kv_cache=bool(kv_cache))
         model = make_model(algo, *sizes, **ways)
         work = functools.partial(act, model, n, n_envs, first)
-    result = profile(work) if profiled else work()
+    work_profile = operations if what == "train" else calls
+    result = shares(work_profile(work)) if profiled else work()
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(json.dumps({**result, "peak_mib": peak, "version": sb3_dtfm.__version__, "torch": th.__version__}))
 
