@@ -11,13 +11,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from peers import cells, command
+from peers import cells, command, table
 from peers.process import PeerError, PeerProcess
 from peers.protocol import read_dataset, receive, send
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.evaluation import FINAL_STATES, evaluate, make_seeded_envs
-from sb3_dtfm.benchmark.rows import read_rows
+from sb3_dtfm.benchmark.rows import read_rows, write_row
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer, load_dataset
 from sb3_dtfm.zoo.arguments import UsageError
 
@@ -185,6 +185,32 @@ def test_a_finished_cell_is_a_row_and_is_not_run_again(tmp_path, datasets, buffe
     assert file.read_text() == before
     with pytest.raises(UsageError, match=r"is there with another minutes"):
         command.main(command_line(tmp_path, datasets, "--minutes", "2"))
+
+
+def test_the_table_has_a_line_for_each_cell_and_tells_the_best(tmp_path, datasets, monkeypatch):
+    monkeypatch.setitem(cells.WORKERS, "d3rlpy", TINY)
+    command.main(command_line(tmp_path, datasets))
+    (row,) = read_rows(next((tmp_path / "rows").glob("*.jsonl")))
+    (tmp_path / "made").mkdir()
+    made = [("door-mixed", "bc", 0, 10.0), ("door-mixed", "bc", 1, 30.0), ("door-mixed-longer", "bc", 0, 2000.0)]
+    made += [("walker2d-mediocre-noisy", "bc", 0, 5.0), ("walker2d-mediocre-noisy", "dtfm", 0, 4.0)]
+    for number, (label, algo, seed, each) in enumerate(made):
+        changed = {"label": label, "algo": algo, "seed": seed, "returns": [each] * 3, "action_ms": 0.5}
+        write_row(tmp_path / "made" / f"{number}.jsonl", {**row, **changed})
+    header, *lines = table.long_table(tmp_path / "made")
+    assert header[:5] == ("data", "algorithm", "seeds", "final", "each seed")
+    assert [line[:5] for line in lines] == [
+        ("walker2d-mediocre-noisy", "dtfm", "0", "4 (1 seed)", "4"),
+        ("walker2d-mediocre-noisy", "bc", "0", "5 (1 seed)", "5"),
+        # 20 and Student's t: 12.706 * 14.142 / sqrt(2).
+        ("door-mixed", "bc", "0, 1", "20 [-107, 147]", "10; 30"),
+        ("door-mixed", "bc, longer", "0", "2,000 (1 seed)", "2,000"),
+    ]
+    assert list(table.short_table(tmp_path / "made")) == [
+        ("data", "dtfm", "bc", "bc, longer"),
+        ("walker2d-mediocre-noisy", "4 (1 seed)", "**5 (1 seed)**", "-"),
+        ("door-mixed", "-", "20 [-107, 147]", "**2,000 (1 seed)**"),
+    ]
 
 
 class Counting:

@@ -1,0 +1,95 @@
+"""
+The rows of `make peers` as a table: success in percent or return, mean over seeds and its 95 % interval (Student's t).
+
+    PYTHONPATH=studies python -m peers.table results/peers           # a line for each dataset and algorithm
+    PYTHONPATH=studies python -m peers.table results/peers --short   # a line for each dataset
+"""
+
+import argparse
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from peers.cells import HERE, Data, Peer, read_entries
+from peers.process import STUDIES
+from sb3_dtfm.algorithms import ALGORITHMS
+from sb3_dtfm.benchmark.report.runs import Run, read_studies
+from sb3_dtfm.benchmark.report.statistics import student_t
+
+NONE = "-"
+Cells = dict[tuple[str, str], list[Run]]  # by dataset and algorithm
+
+
+def read(folder: Path) -> tuple[Cells, list[str], list[str]]:
+    """The runs, their datasets and their algorithms, as the YAML files have them; the rest of a label names the latter."""
+    datasets = list(read_entries(STUDIES / "peers.yml", Data))
+    known = [*ALGORITHMS, *read_entries(HERE / "settings.yml", Peer)]
+    cells: Cells = {}
+    for group in (group for study in read_studies([folder]) for group in study.groups):
+        name = max((each for each in datasets if f"{group.label}-".startswith(f"{each}-")), key=len)
+        changed = group.label[len(name) + 1 :]
+        for (_, _, algo), runs in group.runs.items():
+            cells.setdefault((name, ", ".join(filter(None, (algo, changed)))), []).extend(runs)
+    algorithms = sorted({algo for _, algo in cells}, key=lambda algo: (known.index(algo.partition(",")[0]), algo))
+    return cells, [name for name in datasets if any(name == each for each, _ in cells)], algorithms
+
+
+def result(runs: Sequence[Run]) -> str:
+    """Mean and interval; a single run has none, and runs that are all alike."""
+    interval = student_t([float(run.value("final") or 0.0) for run in runs])
+    unit = " %" if runs[0].counts_success else ""
+    limits = "" if math.isnan(interval.low) else f" [{interval.low:,.0f}, {interval.high:,.0f}]"
+    return f"{interval.estimate:,.0f}{unit}{limits}" + (" (1 seed)" if len(runs) == 1 else "")
+
+
+def mean_of(runs: Sequence[Run], key: str, form: str) -> str:
+    """Mean over runs of a number in their final rows."""
+    return format(np.mean([run.final[key] for run in runs]), form)
+
+
+def long_table(folder: Path) -> Iterable[Sequence[str]]:
+    """Lines of results, minutes of training, gradient steps, and milliseconds an action."""
+    cells, datasets, algorithms = read(folder)
+    yield "data", "algorithm", "seeds", "final", "each seed", "minutes", "gradient steps", "ms an action", "commits"
+    for name in datasets:
+        for algo in algorithms:
+            if runs := cells.get((name, algo)):
+                yield (
+                    name,
+                    algo,
+                    ", ".join(str(run.cell.seed) for run in runs),
+                    result(runs),
+                    "; ".join(f"{run.value('final'):,.0f}" for run in runs),
+                    f"{np.mean([run.minutes for run in runs]):.1f}",
+                    mean_of(runs, "step", ",.0f"),
+                    mean_of(runs, "action_ms", ".2f"),
+                    ", ".join(dict.fromkeys(run.commit for run in runs)),
+                )
+
+
+def short_table(folder: Path) -> Iterable[Sequence[str]]:
+    """Lines of results alone, the largest mean in bold."""
+    cells, datasets, algorithms = read(folder)
+    yield "data", *algorithms
+    for name in datasets:
+        runs = {algo: cells[name, algo] for algo in algorithms if (name, algo) in cells}
+        means = {algo: float(np.mean([run.value("final") for run in each])) for algo, each in runs.items()}
+        bold = {algo: "**" if mean == max(means.values()) else "" for algo, mean in means.items()}
+        yield name, *(f"{bold[algo]}{result(runs[algo])}{bold[algo]}" if algo in runs else NONE for algo in algorithms)
+
+
+def main() -> None:
+    """See the top."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--short", action="store_true")
+    options = parser.parse_args()
+    header, *lines = (short_table if options.short else long_table)(options.folder)
+    for line in (header, ["---"] * len(header), *lines):
+        print(f"| {' | '.join(line)} |")
+
+
+if __name__ == "__main__":
+    main()
