@@ -59,6 +59,7 @@ ACCEPTED: dict[str, Rule] = {
     "dataset_seed": Number(low=0, whole=True),
     "timestep_exponent": POSITIVE,
     "return_weight": NOT_NEGATIVE,
+    "return_steps": Number(low=1, whole=True, optional=True),
     "max_grad_norm": NOT_NEGATIVE._replace(optional=True),
     "warmup_steps": Number(low=0, whole=True),
     "learning_rate_schedule": Choice(LEARNING_RATE_SCHEDULES),
@@ -88,6 +89,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         [0, 1]: above 1 an episode's start, of which there is little in long episodes, is learned from more often
     :param return_weight: w: of mixed data, a step of the best episode is learned from 1 + w times as often as one of the
         worst, and others by their returns in between (Yue et al., 2022); 0 learns from all alike
+    :param return_steps: n: a step's return-to-go is the rewards of n steps and what followed on average after such an
+        observation, so that asking for the best does not ask for luck (Paster et al., 2022); None takes what was recorded
     :param dataset_kwargs: further arguments of :func:`~sb3_dtfm.data.load_dataset`: `{"cache_dir": folder}` for datasets
         larger than memory, `{"env_id": id}` for data that were recorded under another environment's name, and the
         reader's own, for example `{"filter_key": "train"}` for robomimic
@@ -124,6 +127,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         dataset_seed: int = 0,
         timestep_exponent: float = 1.0,
         return_weight: float = 0.0,
+        return_steps: int | None = None,
         dataset_kwargs: dict[str, Any] | None = None,
         max_grad_norm: float | None = None,
         warmup_steps: int = 0,
@@ -162,6 +166,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         self.dataset_seed = dataset_seed
         self.timestep_exponent = timestep_exponent
         self.return_weight = return_weight
+        self.return_steps = return_steps
         self.dataset_kwargs = dataset_kwargs
         self.max_grad_norm = max_grad_norm
         self.warmup_steps = warmup_steps
@@ -226,7 +231,10 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         self._check_spaces(observation_space, buffer.action_space, f"{buffer.source} holds", "the environment's are")
         if self.env is not None:
             self._check_task(buffer, self.env)
-        self.buffer = buffer.random_fraction(self.dataset_fraction, self.dataset_seed).to(self.device)
+        buffer = buffer.random_fraction(self.dataset_fraction, self.dataset_seed)
+        if self.return_steps is not None:
+            buffer = buffer.with_expected_returns(self.return_steps, self.dataset_seed)
+        self.buffer = buffer.to(self.device)
         return self.buffer
 
     def _check_spaces(self, observation_space: spaces.Space, action_space: ActionSpace, found: str, expected: str) -> None:

@@ -18,7 +18,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch.nn import functional as F
 
 from sb3_dtfm import DT, DTFM
-from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer
+from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer, expected
 from sb3_dtfm.data.cache import Fingerprint, load_cached
 from tests.conftest import TINY_FLOW_POLICY, TINY_POLICY, make_env, record_random_episodes
 
@@ -236,6 +236,20 @@ def test_without_time_steps_and_with_more_starts(algorithm, policy_kwargs, cheet
     assert loaded.timestep_exponent == 1.5
     assert loaded.return_weight == 5.0
     assert loaded.policy.network.trunk.embed_timestep is None
+
+
+def test_expected_returns_are_what_is_learned_from_and_asked_for(cheetah_buffer, tmp_path, monkeypatch):
+    monkeypatch.setattr(expected, "N_TIMESTEPS", 20)
+    model = make_model(DTFM, cheetah_buffer, return_steps=10, policy_kwargs=dict(clip_return_to_go=True))
+    wanted = cheetah_buffer.with_expected_returns(10, seed=0)
+    assert th.equal(model.buffer.returns_to_go, wanted.returns_to_go)
+    assert th.equal(model.policy.normalization.return_to_go_range, wanted.return_to_go_range())
+    assert model.score_reference == cheetah_buffer.score_reference
+    model.learn(2).save(tmp_path / "model")
+    loaded = DTFM.load(tmp_path / "model", dataset=cheetah_buffer)
+    assert loaded.return_steps == 10
+    loaded.learn(1)
+    assert th.equal(loaded.buffer.returns_to_go, wanted.returns_to_go)
 
 
 @pytest.mark.parametrize(("algorithm", "policy_kwargs"), ALGORITHMS, ids=IDS)

@@ -1,0 +1,80 @@
+"""What followed observations on average, where an episode tells what followed once."""
+
+import math
+from typing import NamedTuple
+
+import torch as th
+from torch import nn
+from torch.nn import functional as F
+
+from sb3_dtfm.data.episodes import Statistics
+
+HIDDEN_DIM, DROPOUT = 256, 0.1
+N_TIMESTEPS, BATCH_SIZE, LEARNING_RATE, WEIGHT_DECAY = 6000, 512, 1e-3, 1e-2
+N_AT_ONCE = 8192
+# Standard deviations at which observations are clipped, and what is smaller than this is a constant.
+CLIP, SMALLEST_STD = 10.0, 1e-6
+
+
+class Steps(NamedTuple):
+    """
+    Steps of episodes, in any order, and where they lie in flat tensors.
+
+    :param observations: (N, O), of which `rows` are read
+    :param returns_to_go: (N,)
+    :param rows: (M,) int64
+    :param timesteps: (M,) int64
+    """
+
+    observations: th.Tensor
+    returns_to_go: th.Tensor
+    rows: th.Tensor
+    timesteps: th.Tensor
+
+
+def mean_returns_to_go(steps: Steps, statistics: Statistics, seed: int) -> th.Tensor:
+    """
+    The mean return-to-go by observation and time step: a small network's regression (Monte Carlo policy evaluation).
+
+    Dropout and weight decay keep it from learning episodes by heart. Global random numbers stay as they are.
+
+    :param steps: what is learned from, and asked about
+    :param statistics: of their observations
+    :param seed: of weights, batches and dropout
+    :return: (M,) float32
+    """
+    mean, std = (th.as_tensor(each, dtype=th.float32) for each in (statistics.observation_mean, statistics.observation_std))
+    std = th.where(std > SMALLEST_STD, std, 1.0)
+    n_timesteps = int(steps.timesteps.max()) + 1
+    scale = statistics.return_scale or 1.0
+
+    def seen(chosen: th.Tensor) -> th.Tensor:
+        observations = ((steps.observations.index_select(0, steps.rows[chosen]) - mean) / std).clamp(-CLIP, CLIP)
+        return th.cat((observations, steps.timesteps[chosen].unsqueeze(1) / n_timesteps), dim=1)
+
+    n_steps = len(steps.rows)
+    with th.random.fork_rng(devices=[]), th.enable_grad():
+        th.manual_seed(seed)
+        network = _network(steps.observations.shape[1] + 1)
+        optimizer = th.optim.AdamW(network.parameters(), LEARNING_RATE, weight_decay=WEIGHT_DECAY, fused=True)
+        for i in range(N_TIMESTEPS):
+            for group in optimizer.param_groups:
+                group["lr"] = LEARNING_RATE * 0.5 * (1.0 + math.cos(math.pi * i / N_TIMESTEPS))
+            chosen = th.randint(n_steps, (BATCH_SIZE,))
+            wanted = steps.returns_to_go.index_select(0, steps.rows[chosen]) / scale
+            optimizer.zero_grad(set_to_none=True)
+            F.mse_loss(network(seen(chosen)).squeeze(1), wanted).backward()
+            optimizer.step()
+    network.eval()
+    with th.no_grad():
+        return scale * th.cat([network(seen(part)).squeeze(1) for part in th.arange(n_steps).split(N_AT_ONCE)])
+
+
+def _network(input_dim: int) -> nn.Sequential:
+    sizes = (input_dim, HIDDEN_DIM, HIDDEN_DIM)
+    hidden = [
+        layer
+        for i in (0, 1)
+        for layer in (nn.Linear(sizes[i], sizes[i + 1]), nn.LayerNorm(sizes[i + 1]), nn.ReLU(), nn.Dropout(DROPOUT))
+    ]
+    return nn.Sequential(*hidden, nn.Linear(HIDDEN_DIM, 1))

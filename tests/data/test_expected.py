@@ -1,0 +1,75 @@
+"""Returns-to-go of what follows on average: known averages, what stays as recorded, and that it repeats."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+
+from sb3_dtfm.data import Trajectory, TrajectoryBuffer, expected
+
+N_STEPS, LUCK, N_EPISODES = 6, 30.0, 40
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr(expected, "N_TIMESTEPS", 300)
+    monkeypatch.setattr(expected, "BATCH_SIZE", 128)
+
+
+@pytest.fixture
+def buffer() -> TrajectoryBuffer:
+    """
+    All begin at 0. Half go by 1 and earn one a step; half go by -1 and earn at the last step: thirty one time in ten.
+
+    So they reach 6 for sure, and 3 on average.
+    """
+    episodes = []
+    for i in range(N_EPISODES):
+        gambles, lucky = i % 2 == 1, i % 20 == 1
+        observations = np.full((N_STEPS, 1), -1.0 if gambles else 1.0, np.float32)
+        observations[0] = 0.0
+        rewards = np.zeros(N_STEPS) if gambles else np.ones(N_STEPS)
+        rewards[-1] += LUCK * lucky
+        episodes.append(Trajectory(observations, np.zeros((N_STEPS, 1), np.float32), rewards, terminated=True))
+    return TrajectoryBuffer.from_trajectories(episodes, spaces.Box(-1, 1, (1,)))
+
+
+def by_episode(buffer: TrajectoryBuffer) -> np.ndarray:
+    return buffer.returns_to_go[buffer.rows].view(-1, N_STEPS).numpy()
+
+
+def test_luck_becomes_what_follows_on_average(buffer):
+    found = by_episode(buffer.with_expected_returns(1, seed=0))
+    np.testing.assert_allclose(found[::2, 0], 6.0, atol=0.4)
+    np.testing.assert_allclose(found[1::2, 0], 3.0, atol=0.4)
+    # Within the last n steps nothing comes after them, and luck is what was recorded.
+    np.testing.assert_array_equal(found[:, -1], by_episode(buffer)[:, -1])
+    assert found[1, -1] == LUCK
+    # The rewards of n steps are those of the episode: what lies n before its end has all of them.
+    np.testing.assert_allclose(by_episode(buffer.with_expected_returns(N_STEPS, seed=0)), by_episode(buffer))
+
+
+def test_what_was_recorded_stays(buffer):
+    before = buffer.returns_to_go.clone()
+    th.manual_seed(5)
+    state = th.random.get_rng_state()
+    changed = buffer.with_expected_returns(2, seed=0)
+    assert th.equal(th.random.get_rng_state(), state)
+    assert th.equal(buffer.returns_to_go, before)
+    np.testing.assert_array_equal(changed.episode_returns, buffer.episode_returns)
+    assert changed.observations is buffer.observations
+    assert changed.rewards is buffer.rewards
+
+
+def test_the_same_seed_gives_the_same_numbers(buffer):
+    first, again, other = (buffer.with_expected_returns(2, seed).returns_to_go for seed in (0, 0, 1))
+    assert th.equal(first, again)
+    assert not th.equal(first, other)
+
+
+def test_some_of_the_episodes_are_learned_from_alone(buffer):
+    """Without the lucky ones nobody who goes by -1 earns anything, and the others' numbers are not touched."""
+    chosen = np.array([i for i in range(N_EPISODES) if i % 20 != 1])
+    changed = buffer.select(chosen).with_expected_returns(1, seed=0)
+    np.testing.assert_allclose(by_episode(changed)[chosen % 2 == 1, 0], 0.0, atol=0.4)
+    assert th.equal(changed.returns_to_go[N_STEPS : 2 * N_STEPS], buffer.returns_to_go[N_STEPS : 2 * N_STEPS])
