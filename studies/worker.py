@@ -2,8 +2,9 @@
 Measure DT or DTFM; run by `compare.py`, each measurement in a process of its own.
 
 `python worker.py train MODEL N` or `python worker.py act MODEL N SOLVER SOLVER_STEPS KV_CACHE N_ENVS FIRST` prints one line
-of JSON; MODEL is ALGO WIDTH LAYERS FLOW_HIDDEN_DIM TOKENS_PER_STEP. `python worker.py profile MODEL N` prints the share of
-the processor's time that each of torch's operations takes in as many steps of training, in float32.
+of JSON; MODEL is ALGO WIDTH LAYERS FLOW_HIDDEN_DIM TOKENS_PER_STEP. `python worker.py profile train MODEL N
+[PRECISION]` prints the share of the processor's time that each of torch's operations takes in as many steps of training, in
+float32 unless said otherwise, and `profile act ...` that of each function.
 """
 
 import cProfile
@@ -125,7 +126,7 @@ def main() -> None:
     what, algo, *numbers = arguments[profiled:]
     *sizes, n = map(int, numbers[:5])
     if what == "train":
-        model = make_model(algo, *sizes, **(dict(precision="float32") if profiled else {}))
+        model = make_model(algo, *sizes, precision=(numbers[5:] or ["float32" if profiled else "auto"])[0])
         work = functools.partial(train, model, n)
     else:
         solver, n_solver_steps, kv_cache, n_envs, first = numbers[5], *map(int, numbers[6:])
