@@ -89,7 +89,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         [0, 1]: above 1 an episode's start, of which there is little in long episodes, is learned from more often
     :param return_weight: w: of mixed data, a step of the best episode is learned from 1 + w times as often as one of the
         worst, and others by their returns in between (Yue et al., 2022); 0 learns from all alike
-    :param return_steps: n: a step's return-to-go is the rewards of n steps and what followed on average after such an
+    :param return_steps: n: a step's return-to-go is the rewards of n steps and what may be expected after such an
         observation, so that asking for the best does not ask for luck (Paster et al., 2022); None takes what was recorded
     :param dataset_kwargs: further arguments of :func:`~sb3_dtfm.data.load_dataset`: `{"cache_dir": folder}` for datasets
         larger than memory, `{"env_id": id}` for data that were recorded under another environment's name, and the

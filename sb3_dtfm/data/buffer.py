@@ -14,7 +14,7 @@ from gymnasium.envs.registration import parse_env_id
 
 from sb3_dtfm.actions import ActionSpace, bounds_of, from_vectors, to_vectors, vector_space
 from sb3_dtfm.data.episodes import EpisodeTable, Statistics, moments
-from sb3_dtfm.data.expected import Steps, mean_returns_to_go
+from sb3_dtfm.data.expected import Steps, expected_returns_to_go
 from sb3_dtfm.data.storage import STEP_ARRAYS, FileStorage, MappedSteps, MemoryStorage
 from sb3_dtfm.data.trajectories import (
     DatasetError,
@@ -251,23 +251,24 @@ class TrajectoryBuffer:
 
     def with_expected_returns(self, n_steps: int, seed: int) -> "TrajectoryBuffer":
         """
-        A buffer whose returns-to-go are luckless: what came after n steps is replaced by what came on average after such an
-        observation (n-step returns, Sutton and Barto, 2018, section 7.1; conditioning on expected returns: Paster et al.,
-        2022). Without that, asking for the best return asks for what the luckiest did. Returns of episodes, and what draws
-        them, stay what was recorded.
+        A buffer whose returns-to-go are hardly luck: what came after n steps is replaced by what may be expected after such
+        an observation, an expectile of 0.9 (n-step returns, Sutton and Barto, 2018, section 7.1; conditioning on expected
+        returns: Paster et al., 2022). Without that, asking for the best return asks for what the luckiest did. Returns of
+        episodes, and what draws them, stay what was recorded.
 
         :param n_steps: n, steps whose rewards count as they came
-        :param seed: of the network that learns the average; the same one gives the same numbers
+        :param seed: of the network that learns what to expect; the same one gives the same numbers
         :return: on the same flat tensors, but for the returns-to-go
         """
         rows, timesteps, n_left = self._locate(th.arange(len(self), device=self._stops.device))
-        means = mean_returns_to_go(Steps(self.observations, self.returns_to_go, rows, timesteps), self.statistics(), seed)
+        steps = Steps(self.observations, self.returns_to_go, rows, timesteps)
+        expected = expected_returns_to_go(steps, self.statistics(), seed)
         goes_on = th.nonzero(n_left >= n_steps).squeeze(1)
         later = goes_on + n_steps  # positions among the own steps, of the same episode
         changed = copy.copy(self)
         changed.returns_to_go = self.returns_to_go.clone()
         rewarded = self.returns_to_go[rows[goes_on]] - self.returns_to_go[rows[later]]
-        changed.returns_to_go[rows[goes_on]] = rewarded + means[later]
+        changed.returns_to_go[rows[goes_on]] = rewarded + expected[later]
         return changed
 
     def largest_discounted_return(self, gamma: float) -> float:
