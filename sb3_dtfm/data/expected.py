@@ -9,7 +9,7 @@ from torch import nn
 from sb3_dtfm.data.episodes import Statistics
 
 HIDDEN_DIM, DROPOUT = 256, 0.1
-N_TIMESTEPS, BATCH_SIZE, LEARNING_RATE, WEIGHT_DECAY = 6000, 512, 1e-3, 1e-2
+N_TIMESTEPS, BATCH_SIZE, LEARNING_RATE, WEIGHT_DECAY = 3000, 256, 1e-3, 1e-2
 N_AT_ONCE = 8192
 # 0.5 would be the mean, and near 1 the luckiest: what noise spoiled often, a model that leaves it out does often.
 EXPECTILE = 0.9
