@@ -2,8 +2,9 @@
 
 import argparse
 import contextlib
+import itertools
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -84,6 +85,7 @@ class Peer(NamedTuple):
     :param kinds: changes to them by kind of task
     :param only: kinds of tasks that it is for
     :param best_share: share of the episodes that it learns from, those of the largest returns
+    :param changes: what a search has changed, last of all
     """
 
     name: str
@@ -93,10 +95,24 @@ class Peer(NamedTuple):
     kinds: dict[str, dict[str, Any]] = {}  # noqa: RUF012
     only: list[str] = list(KINDS)  # noqa: RUF012
     best_share: float | None = None
+    changes: dict[str, Any] = {}  # noqa: RUF012
 
     def settings_for(self, data: Data) -> dict[str, Any]:
         """The worker's settings for a dataset."""
-        return {**self.settings, **self.kinds.get(data.kind, {}), **data.peers.get(self.name, {})}
+        return {**self.settings, **self.kinds.get(data.kind, {}), **data.peers.get(self.name, {}), **self.changes}
+
+    def changed(self, changes: Mapping[str, Any]) -> "Peer":
+        """
+        The peer with other settings.
+
+        :param changes: the worker's settings, or `best_share`, by name
+        :raises UsageError: a name that it has not
+        """
+        accepted = {"best_share", *self.settings, *itertools.chain(*self.kinds.values())}
+        if unknown := sorted(set(changes) - accepted):
+            raise UsageError(f"-params: {self.name} has no {', '.join(unknown)}; it has {', '.join(sorted(accepted))}.")
+        changes = dict(changes)
+        return self._replace(best_share=changes.pop("best_share", self.best_share), changes=changes)
 
 
 def read_entries(path: Path, entry: type[Any]) -> dict[str, Any]:

@@ -42,7 +42,7 @@ from sb3_dtfm.benchmark.rows import write_row
 from sb3_dtfm.cli import benchmark
 from sb3_dtfm.data import DatasetError
 from sb3_dtfm.files import replacing
-from sb3_dtfm.zoo.arguments import UsageError, import_packages
+from sb3_dtfm.zoo.arguments import UsageError, import_packages, key_values
 
 FOLDERS = {"d3rlpy": ".venv-peers", "robomimic": ".venv-robomimic"}  # the environments of the Makefile
 
@@ -59,6 +59,14 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
     add("--minutes", type=float, metavar="N", help="of a peer's training on one core; the dataset's by default")
     add("--steps", type=int, metavar="N", help="gradient steps of a peer, instead of minutes")
     add("--label", default="", help="added to the dataset's name in the rows, for what was changed")
+    several = {"nargs": "+", "action": "extend", "default": []}
+    add(
+        "-params",
+        "--hyperparams",
+        **several,
+        metavar="KEY:VALUE",
+        help="settings to change, of peers or ours; needs --label",
+    )
     add("--final-episodes", type=int, default=100, metavar="N", help="100 by default")
     add("--n-eval-envs", type=int, default=10, metavar="N", help="environments side by side; 10 by default")
     add("-o", "--results", default="mine", metavar="DIR", help="where rows go; mine by default")
@@ -72,6 +80,9 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
         value = getattr(options, name)
         if value is not None and value <= 0:
             raise UsageError(f"--{name.replace('_', '-')}: must be more than 0, got {value}.")
+    if options.hyperparams and not options.label:
+        raise UsageError("-params: needs --label, or the rows would pass for the authors' settings.")
+    options.hyperparams = key_values("-params", options.hyperparams)
     if min(options.seeds) < 0:
         raise UsageError(f"--seeds: must be 0 or more, got {min(options.seeds)}.")
     return options
@@ -140,7 +151,8 @@ def run_ours(data: Data, algos: Sequence[str], seed: int, options: argparse.Name
         command += ["-f", options.log_folder, "--final-episodes", str(options.final_episodes), "--eval-episodes", "10"]
         command += ["--n-eval-envs", str(options.n_eval_envs), "-n", str(data.our_steps), "--eval-freq", str(data.our_steps)]
         command += ["--gym-packages", *data.gym_packages] if data.gym_packages else []
-        command += ["-params", *(f"{key}:{value!r}" for key, value in data.params.items())] if data.params else []
+        params = {**data.params, **options.hyperparams}
+        command += ["-params", *(f"{key}:{value!r}" for key, value in params.items())] if params else []
         try:
             benchmark.main(command)
         except SystemExit as end:
@@ -204,7 +216,7 @@ def main(argv: Sequence[str]) -> None:
     algos = choose(options.algos, [*ALGORITHMS, *known_peers], "--algo")
     ours, peers = (
         [name for name in algos if name in ALGORITHMS],
-        [known_peers[name] for name in algos if name in known_peers],
+        [known_peers[name].changed(options.hyperparams) for name in algos if name in known_peers],
     )
     check_workers(peers, options)
     names = choose(options.data, list(known_data), "--data")

@@ -213,6 +213,17 @@ def test_the_table_has_a_line_for_each_cell_and_tells_the_best(tmp_path, dataset
     ]
 
 
+def test_a_search_changes_settings_and_names_its_rows(tmp_path, datasets, monkeypatch):
+    monkeypatch.setitem(cells.WORKERS, "d3rlpy", TINY)
+    command.main(command_line(tmp_path, datasets, "--label", "slow", "-params", "learning_rate:0.1", "best_share:0.4"))
+    (file,) = (tmp_path / "rows").glob("*.jsonl")
+    (row,) = read_rows(file)
+    assert (file.stem, row["label"]) == ("Pendulum-v1_1_linear_seed3_authors_pendulum-slow", "pendulum-slow")
+    assert row["settings"]["d3rlpy"] == {"learning_rate": 0.1}
+    assert row["settings"]["best_share"] == 0.4
+    assert PEERS["bc"].changed({"hidden": [8]}).settings["hidden"] == [512] * 3, "the other rows' settings stay"
+
+
 class Counting:
     """Acts as the tiny worker does in a space of one action: by how long the episode has been."""
 
@@ -243,6 +254,8 @@ def test_a_failing_cell_leaves_no_row_and_does_not_stop_the_others(tmp_path, dat
         (("--data", "moon"), r"--data: unknown moon; known are pendulum"),
         (("--algo", "moon"), r"--algo: unknown moon; known are dt, dtfm, linear"),
         (("--steps", "0"), r"--steps: must be more than 0, got 0"),
+        (("-params", "learning_rate:0.1"), r"-params: needs --label"),
+        (("--label", "a", "-params", "rate:0.1"), r"-params: linear has no rate; it has best_share, learning_rate"),
         (("--d3rlpy-python", "nowhere/python"), r"nowhere/python does not exist; `make peers` installs it"),
     ],
 )
