@@ -17,6 +17,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import yaml
 from filelock import FileLock, Timeout
@@ -59,7 +60,7 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
     add("--minutes", type=float, metavar="N", help="of a peer's training on one core; the dataset's by default")
     add("--steps", type=int, metavar="N", help="gradient steps of a peer, instead of minutes")
     add("--label", default="", help="added to the dataset's name in the rows, for what was changed")
-    several = {"nargs": "+", "action": "extend", "default": []}
+    several: dict[str, Any] = {"nargs": "+", "action": "extend", "default": []}
     add(
         "-params",
         "--hyperparams",
