@@ -253,26 +253,18 @@ class TrajectoryBuffer:
         """
         A buffer whose returns-to-go are hardly luck: what came after n steps is replaced by what may be expected after such
         an observation, an expectile of 0.9 (conditioning on expected returns: Paster et al., 2022). Without that, asking for
-        the best return asks for what the luckiest did. It is the mean of the n-step returns (Sutton and Barto, 2018, section
-        7.1) for n to 2 n steps, since what is expected at one observation differs from that at the next one by chance.
-        Returns of episodes, and what draws them, stay what was recorded.
+        the best return asks for what the luckiest did. Returns of episodes, and what draws them, stay what was recorded.
+        See :func:`~sb3_dtfm.data.expected.expected_returns_to_go`.
 
         :param n_steps: n, steps whose rewards count as they came
         :param seed: of the network that learns what to expect; the same one gives the same numbers
         :return: on the same flat tensors, but for the returns-to-go
         """
         rows, timesteps, n_left = self._locate(th.arange(len(self), device=self._stops.device))
-        recorded = self.returns_to_go[rows]
-        steps = Steps(self.observations, self.returns_to_go, rows, timesteps)
-        # How much more than what was recorded may be expected at each step, summed up over the steps before.
-        surplus = expected_returns_to_go(steps, self.statistics(), seed) - recorded
-        summed = th.cat((surplus.new_zeros(1), surplus)).double().cumsum(0)
-        goes_on = th.nonzero(n_left >= n_steps).squeeze(1)
-        first, last = goes_on + n_steps, goes_on + n_left[goes_on].clamp(max=2 * n_steps)
-        recorded[goes_on] += ((summed[last + 1] - summed[first]) / (last + 1 - first)).float()
+        steps = Steps(self.observations, self.returns_to_go, rows, timesteps, n_left)
         changed = copy.copy(self)
         changed.returns_to_go = self.returns_to_go.clone()
-        changed.returns_to_go[rows] = recorded
+        changed.returns_to_go[rows] = expected_returns_to_go(steps, n_steps, self.statistics(), seed)
         return changed
 
     def largest_discounted_return(self, gamma: float) -> float:

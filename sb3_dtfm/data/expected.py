@@ -19,21 +19,45 @@ CLIP, SMALLEST_STD = 10.0, 1e-6
 
 class Steps(NamedTuple):
     """
-    Steps of episodes, in any order, and where they lie in flat tensors.
+    Steps of episodes, one after the other, and where they lie in flat tensors.
 
     :param observations: (N, O), of which `rows` are read
     :param returns_to_go: (N,)
     :param rows: (M,) int64
     :param timesteps: (M,) int64
+    :param n_left: (M,) int64, how many steps of the episode come after
     """
 
     observations: th.Tensor
     returns_to_go: th.Tensor
     rows: th.Tensor
     timesteps: th.Tensor
+    n_left: th.Tensor
 
 
-def expected_returns_to_go(steps: Steps, statistics: Statistics, seed: int) -> th.Tensor:
+def expected_returns_to_go(steps: Steps, n_steps: int, statistics: Statistics, seed: int) -> th.Tensor:
+    """
+    Returns-to-go of which what came after n steps is replaced by what may be expected there.
+
+    They are means of n-step returns (Sutton and Barto, 2018, section 7.1), of n to 2 n steps: what is expected at one
+    observation differs from that at the next one by chance. A step with fewer than n to follow keeps what was recorded.
+
+    :param steps: what is learned from, and asked about
+    :param n_steps: n
+    :param statistics: of their observations
+    :param seed: of the regression
+    :return: (M,) float32
+    """
+    returns_to_go = steps.returns_to_go[steps.rows]
+    surplus = _regression(steps, statistics, seed) - returns_to_go
+    summed = th.cat((surplus.new_zeros(1), surplus)).double().cumsum(0)
+    goes_on = th.nonzero(steps.n_left >= n_steps).squeeze(1)
+    first, last = goes_on + n_steps, goes_on + steps.n_left[goes_on].clamp(max=2 * n_steps)
+    returns_to_go[goes_on] += ((summed[last + 1] - summed[first]) / (last + 1 - first)).float()
+    return returns_to_go
+
+
+def _regression(steps: Steps, statistics: Statistics, seed: int) -> th.Tensor:
     """
     An expectile of the return-to-go by observation and time step: a small network's regression (Monte Carlo policy
     evaluation, by the asymmetric squared error of Newey and Powell, 1987).

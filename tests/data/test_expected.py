@@ -73,3 +73,11 @@ def test_some_of_the_episodes_are_learned_from_alone(buffer):
     changed = buffer.select(chosen).with_expected_returns(1, seed=0)
     np.testing.assert_allclose(by_episode(changed)[chosen % 2 == 1, 0], 0.0, atol=0.4)
     assert th.equal(changed.returns_to_go[N_STEPS : 2 * N_STEPS], buffer.returns_to_go[N_STEPS : 2 * N_STEPS])
+
+
+def test_the_rewards_of_n_to_2_n_steps_count_as_they_came(buffer, monkeypatch):
+    """Where nothing is expected, the mean of these sums is left: of ones, 2 and 3 and 4, or as many as are left."""
+    monkeypatch.setattr(expected, "_regression", lambda steps, statistics, seed: th.zeros(len(steps.rows)))
+    found = by_episode(buffer.with_expected_returns(2, seed=0))
+    np.testing.assert_allclose(found[0], [3.0, 3.0, 2.5, 2.0, 2.0, 1.0])
+    np.testing.assert_allclose(found[1], [0.0, 0.0, 0.0, 0.0, LUCK, LUCK])
