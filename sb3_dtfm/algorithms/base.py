@@ -233,6 +233,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
             self._check_task(buffer, self.env)
         buffer = buffer.random_fraction(self.dataset_fraction, self.dataset_seed)
         if self.return_steps is not None:
+            if self.verbose >= 1 and is_first_process():
+                print(f"Learning which returns may be expected (return_steps={self.return_steps})", flush=True)
             buffer = buffer.with_expected_returns(self.return_steps, self.dataset_seed)
         self.buffer = buffer.to(self.device)
         return self.buffer

@@ -238,9 +238,10 @@ def test_without_time_steps_and_with_more_starts(algorithm, policy_kwargs, cheet
     assert loaded.policy.network.trunk.embed_timestep is None
 
 
-def test_expected_returns_are_what_is_learned_from_and_asked_for(cheetah_buffer, tmp_path, monkeypatch):
+def test_expected_returns_are_what_is_learned_from_and_asked_for(cheetah_buffer, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(expected, "N_TIMESTEPS", 20)
-    model = make_model(DTFM, cheetah_buffer, return_steps=10, policy_kwargs=dict(clip_return_to_go=True))
+    model = make_model(DTFM, cheetah_buffer, return_steps=10, policy_kwargs=dict(clip_return_to_go=True), verbose=1)
+    assert "Learning which returns may be expected (return_steps=10)" in capsys.readouterr().out
     wanted = cheetah_buffer.with_expected_returns(10, seed=0)
     assert th.equal(model.buffer.returns_to_go, wanted.returns_to_go)
     assert th.equal(model.policy.normalization.return_to_go_range, wanted.return_to_go_range())
