@@ -37,10 +37,11 @@ def read(folder: Path) -> tuple[Cells, list[str], list[str]]:
 
 
 def result(runs: Sequence[Run]) -> str:
-    """Mean and interval; a single run has none, and runs that are all alike."""
+    """Mean and interval, of shares within what a share can be; a single run has none, and runs that are all alike."""
     interval = student_t([float(run.value("final") or 0.0) for run in runs])
-    unit = " %" if runs[0].counts_success else ""
-    limits = "" if math.isnan(interval.low) else f" [{interval.low:,.0f}, {interval.high:,.0f}]"
+    unit, lowest, highest = (" %", 0.0, 100.0) if runs[0].counts_success else ("", -math.inf, math.inf)
+    low, high = max(interval.low, lowest), min(interval.high, highest)
+    limits = "" if math.isnan(interval.low) else f" [{low:,.0f}, {high:,.0f}]"
     return f"{interval.estimate:,.0f}{unit}{limits}" + (" (1 seed)" if len(runs) == 1 else "")
 
 
