@@ -95,7 +95,6 @@ def _regression(steps: Steps, statistics: Statistics, seed: int) -> th.Tensor:
             missing = wanted - expected(chosen)
             th.where(missing > 0, EXPECTILE * missing.square(), (1.0 - EXPECTILE) * missing.square()).mean().backward()
             optimizer.step()
-    network.eval()
     with th.no_grad():
         return scale * th.cat([expected(part) for part in th.arange(n_steps).split(N_AT_ONCE)])
 
