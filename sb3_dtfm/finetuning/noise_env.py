@@ -18,6 +18,8 @@ from sb3_dtfm.windows import Context
 
 # Of the noise, as in diffusion steering (Wagenmaker et al., 2025).
 NOISE_BOUND = 1.5
+# Of a model that acts by one, which leaves nothing to choose.
+STEERED_SOLVER_STEPS = 10
 
 
 class NoiseSpace(spaces.Box):
@@ -56,7 +58,8 @@ class NoiseActionVecEnv(VecEnvWrapper):
     :param model: a DTFM, or the path to a saved one
     :param bound: largest absolute noise
     :param hidden_state: show the trunk's hidden state as well
-    :raises ValueError: a policy without noise (DT), environments that do not fit it, or an argument out of range
+    :raises ValueError: a policy whose actions do not depend on noise (DT, and one step of Euler, which ends at the mean
+        action), environments that do not fit it, or an argument out of range
     """
 
     def __init__(
@@ -71,6 +74,11 @@ class NoiseActionVecEnv(VecEnvWrapper):
             model = DTFM.load(model, device="cpu")  # type: ignore[arg-type]
         policy = model.policy
         noise_dim = policy.check_steerable()
+        if not policy.network.head.noise_decides:
+            raise ValueError(
+                "n_solver_steps=1: one step of Euler ends at the mean action, from any noise; "
+                f"model.policy.set_acting(n_solver_steps={STEERED_SOLVER_STEPS}) leaves a choice."
+            )
         check_vec_env(venv)
         model._check_spaces(venv.observation_space, venv.action_space, "The environment has", "the model's are")  # type: ignore[arg-type]
         n_shown = policy.observation_dim + 2 + (policy.network.trunk.embed_dim if hidden_state else 0)

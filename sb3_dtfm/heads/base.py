@@ -40,6 +40,11 @@ class ActionHead(nn.Module, ABC):
         parameters = inspect.signature(cls).parameters.values()
         return {each.name: each.default for each in parameters if each.kind is inspect.Parameter.KEYWORD_ONLY}
 
+    @property
+    def noise_decides(self) -> bool:
+        """Whether other noise leads to other actions, as the head acts now."""
+        return self.noise_dim > 0
+
     def check_acting(self, **choices: Any) -> dict[str, Any]:
         """
         :param choices: all of `acting_choices`

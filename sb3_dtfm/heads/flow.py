@@ -123,6 +123,11 @@ class FlowHead(ActionHead):
             raise ValueError(f"solver={ONE_STEP!r} needs a model that was trained with policy_kwargs=dict(one_step=True).")
         return choices
 
+    @property
+    def noise_decides(self) -> bool:
+        """Not by one step of Euler, which ends at the mean action from wherever it begins."""
+        return (self.solver, self.n_solver_steps) != ("euler", 1)
+
     def draw_noise(self, actions: th.Tensor, generator: th.Generator) -> tuple[th.Tensor, ...]:
         batch_size, context_length = actions.shape[:2]
         noise = th.randn(actions.shape, generator=generator, device=actions.device)

@@ -18,6 +18,7 @@ from sb3_dtfm.arguments import with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.files import read_run
 from sb3_dtfm.finetuning import NoiseActionVecEnv, OnlineDTFM, SteeredDTFM
+from sb3_dtfm.finetuning.noise_env import STEERED_SOLVER_STEPS
 from sb3_dtfm.finetuning.online import ACCEPTED
 from sb3_dtfm.zoo.arguments import UsageError
 from sb3_dtfm.zoo.manager import OF_RL_ZOO, OfflineExperimentManager
@@ -135,6 +136,10 @@ class SteeringManager(FinetuningManager):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.steered = SteeredDTFM.of(DTFM.load(self.base_file, device=self.device))
+        policy = self.steered.policy
+        if policy.network.head.noise_dim and not policy.network.head.noise_decides:
+            policy.set_acting(n_solver_steps=STEERED_SOLVER_STEPS)
+            print(f"The model acts by one Euler step, which no noise changes: n_solver_steps={STEERED_SOLVER_STEPS} instead")
         name = Path(self.save_path).name.removeprefix(f"{self.env_name}_")
         uuid = name.lstrip("0123456789")
         self.log_path = f"{self.log_folder}/{STEERED}/"

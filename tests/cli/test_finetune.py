@@ -65,6 +65,17 @@ def test_the_curve_begins_at_the_offline_policys_score(run, workplace):
     assert SteeredDTFM.load(steered / "best_model").steering is None
 
 
+def test_a_model_that_acts_by_its_mean_action_draws_when_it_is_steered(run, workplace, capsys):
+    """As gaits are packaged: there noise would change nothing."""
+    model = DTFM.load(run / "HalfCheetah-v5")
+    model.policy.set_acting(n_solver_steps=1)
+    model.save(run / "HalfCheetah-v5")
+    assert main([*FINETUNE, "--model", str(run), "-params", *QUICK, "learning_starts:100"]) == 0
+    assert "which no noise changes: n_solver_steps=10 instead" in capsys.readouterr().out
+    steered = SteeredDTFM.load(workplace / "logs/steered/HalfCheetah-v5_1/HalfCheetah-v5")
+    assert steered.policy.acting_settings()["n_solver_steps"] == 10
+
+
 def test_ppo_and_a_zip_file_with_a_target_of_its_own(run, workplace):
     quick = ["n_envs:2", "n_steps:8", "batch_size:8", "n_epochs:1", "policy_kwargs:dict(net_arch=[16])"]
     (workplace / "alone.zip").write_bytes((run / "HalfCheetah-v5.zip").read_bytes())

@@ -224,3 +224,7 @@ def test_what_cannot_be_steered_is_refused():
         NoiseActionVecEnv(make_vec_env("HalfCheetah-v5"), _tiny())
     with pytest.raises(ValueError, match="bound must be a number above 0, got -1"):
         NoiseActionVecEnv(make_venv(), _tiny(), bound=-1)
+    mean_action = _tiny()
+    mean_action.policy.set_acting(n_solver_steps=1)
+    with pytest.raises(ValueError, match=r"one step of Euler ends at the mean action.*set_acting\(n_solver_steps=10\)"):
+        NoiseActionVecEnv(make_venv(), mean_action)
