@@ -71,9 +71,9 @@ def test_a_model_that_acts_by_its_mean_action_draws_when_it_is_steered(run, work
     model.policy.set_acting(n_solver_steps=1)
     model.save(run / "HalfCheetah-v5")
     assert main([*FINETUNE, "--model", str(run), "-params", *QUICK, "learning_starts:100"]) == 0
-    assert "which no noise changes: n_solver_steps=10 instead" in capsys.readouterr().out
+    assert "which no noise changes: n_solver_steps=3 instead" in capsys.readouterr().out
     steered = SteeredDTFM.load(workplace / "logs/steered/HalfCheetah-v5_1/HalfCheetah-v5")
-    assert steered.policy.acting_settings()["n_solver_steps"] == 10
+    assert steered.policy.acting_settings()["n_solver_steps"] == 3
 
 
 def test_ppo_and_a_zip_file_with_a_target_of_its_own(run, workplace):
