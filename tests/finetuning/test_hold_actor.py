@@ -12,7 +12,9 @@ from sb3_dtfm.finetuning import HoldActor
 
 @pytest.mark.parametrize("algorithm", [SAC, TD3])
 def test_the_actor_learns_after_the_critics(algorithm):
-    agent = algorithm("MlpPolicy", "Pendulum-v1", learning_starts=10, batch_size=8, policy_kwargs=dict(net_arch=[16]), seed=0)
+    agent = algorithm(
+        "MlpPolicy", "Pendulum-v1", learning_starts=10, batch_size=8, policy_kwargs=dict(net_arch=[16]), seed=0
+    )
     actor, critic = (copy.deepcopy(each.state_dict()) for each in (agent.actor, agent.critic))
 
     def learned(module, before):
