@@ -3,6 +3,7 @@
 from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
+from torch import nn
 
 from sb3_dtfm.arguments import COUNT, check_arguments
 
@@ -38,8 +39,9 @@ class HoldActor(BaseCallback):
         self._actor.requires_grad_(True)
 
     @property
-    def _actor(self) -> Any:
-        return self.model.actor
+    def _actor(self) -> nn.Module:
+        model: Any = self.model
+        return model.actor
 
     def _hold(self) -> None:
         self._actor.requires_grad_(self.model._n_updates >= self.n_updates)
