@@ -220,15 +220,14 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         return self.buffer.sample_transitions(batch_size, self.policy.n_valued, self.policy.gamma, generator)
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
-        remaining = self._current_progress_remaining
-        factor = learning_rate_factor(self.learning_rate_schedule, self._n_learned(), 1.0 - remaining, self.warmup_steps)
-        self._current_learning_rate = factor * self.lr_schedule(remaining)
+        factor = learning_rate_factor(self.learning_rate_schedule, *self._schedule_position(), self.warmup_steps)
+        self._current_learning_rate = factor * self.lr_schedule(self._current_progress_remaining)
         for optimizer in optimizers if isinstance(optimizers, list) else [optimizers]:
             update_learning_rate(optimizer, self._current_learning_rate)
 
-    def _n_learned(self) -> int:
-        """Gradient steps since `learn` began to count."""
-        return self.num_timesteps
+    def _schedule_position(self) -> tuple[int, float]:
+        """Gradient steps since the learning rate's schedule began, and the share of it that is done."""
+        return self.num_timesteps, 1.0 - self._current_progress_remaining
 
     def _choose_training_seed(self) -> int:
         """The run's seed; one that was drawn stays the model's."""

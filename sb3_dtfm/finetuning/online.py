@@ -57,7 +57,7 @@ class OnlineDTFM(DTFM):
     one: `OnlineDTFM.load("can.zip", env, dataset="can.hdf5")` goes on from a DTFM, and `DTFM.load` reads what it saves.
 
     :param n_episodes: own episodes between two times of learning, of all environments together
-    :param gradient_steps: each of these times
+    :param gradient_steps: each of these times, over which `learning_rate_schedule` and `warmup_steps` go
     :ivar own: all own episodes, None before the first ones
     """
 
@@ -70,7 +70,7 @@ class OnlineDTFM(DTFM):
         self._running: list[Step] = []  # of the episodes that have not ended
         self._began: list[int] = []  # where each environment's episode begins in them
         self._state: tuple[np.ndarray, ...] | None = None  # of acting
-        self._n_updates_at_start = 0
+        self._turn_start = 0  # in gradient steps
         super().__init__(*args, **kwargs)
 
     def _check_arguments(self, learning_rate: Rule) -> None:
@@ -79,7 +79,7 @@ class OnlineDTFM(DTFM):
 
     def _excluded_save_params(self) -> list[str]:
         """Also what a DTFM, whose file it is saved as, does not have."""
-        return [*super()._excluded_save_params(), *ACCEPTED, "own", "_running", "_began", "_state", "_n_updates_at_start"]
+        return [*super()._excluded_save_params(), *ACCEPTED, "own", "_running", "_began", "_state", "_turn_start"]
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         """SB3's own, for the environments count here."""
@@ -88,13 +88,15 @@ class OnlineDTFM(DTFM):
         self._training_seconds, self._timed_steps = 0.0, 0
         total_timesteps, callback = BaseAlgorithm._setup_learn(self, *args, **kwargs)
         if self._num_timesteps_at_start == 0:
-            self._means, self._n_updates_at_start = RunningMeans(), self._n_updates
+            self._means = RunningMeans()
         if self._last_obs is not before:  # they have been reset
             self._running, self._began, self._state = [], [0] * self.n_envs, None
         return total_timesteps, callback
 
-    def _n_learned(self) -> int:
-        return self._n_updates - self._n_updates_at_start
+    def _schedule_position(self) -> tuple[int, float]:
+        """Each turn has the whole schedule: what a turn has changed settles before the next episodes."""
+        n_learned = self._n_updates - self._turn_start
+        return n_learned, n_learned / self.gradient_steps
 
     def learn(
         self: SelfOnlineDTFM,
@@ -233,6 +235,7 @@ class OnlineDTFM(DTFM):
     def _imitate(self, parallel: DataParallel) -> None:
         """The gradient steps of a turn; what acting has kept of the old weights' keys and values goes."""
         batches = self._imitated()
+        self._turn_start = self._n_updates
         for _ in range(self.gradient_steps):
             self._train_step(batches, parallel)
         if self._state is not None:

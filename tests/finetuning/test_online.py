@@ -173,26 +173,21 @@ def test_what_it_cannot_learn_with_is_refused(file, cheetah_buffer):
             OnlineDTFM.load(file, make_venv(), dataset=cheetah_buffer, **{name: wrong})
 
 
-def test_the_learning_rate_ends_where_it_should(file, cheetah_buffer):
-    """A turn ends with an episode, beyond the steps that were asked for; warm-up counts gradient steps."""
-    settings = dict(ONLINE, learning_rate=0.1, learning_rate_schedule="linear", n_episodes=1, gradient_steps=1)
+def test_each_turn_has_the_whole_schedule_of_the_learning_rate(file, cheetah_buffer):
+    settings = dict(ONLINE, learning_rate=0.1, learning_rate_schedule="linear", n_episodes=1, gradient_steps=4)
     model = OnlineDTFM.load(file, make_venv((10,), (False,)), dataset=cheetah_buffer, **settings)
     rates = []
     model._gradient_step = lambda *_: (
         model._update_learning_rate(model.policy.optimizer),
         rates.append(model._current_learning_rate),
-    )
-    model.learn(35)
-    np.testing.assert_allclose(rates, 0.1 * (1 - np.array([0, 10, 20, 30]) / 35))
-    model.warmup_steps, model.learning_rate_schedule = 4, "constant"
-    rates.clear()
-    model._gradient_step = lambda *_: (
-        model._update_learning_rate(model.policy.optimizer),
-        rates.append(model._current_learning_rate),
         vars(model).update(_n_updates=model._n_updates + 1),
     )
-    model.learn(45)
-    np.testing.assert_allclose(rates, 0.1 * np.array([0.25, 0.5, 0.75, 1.0, 1.0]))
+    model.learn(15)
+    np.testing.assert_allclose(rates, 0.1 * np.array(2 * [1.0, 0.75, 0.5, 0.25]))
+    model.warmup_steps, model.learning_rate_schedule = 2, "constant"
+    rates.clear()
+    model.learn(15)
+    np.testing.assert_allclose(rates, 0.1 * np.array(2 * [0.5, 1.0, 1.0, 1.0]))
 
 
 def test_episodes_that_had_ended_survive_an_interrupt(model):
