@@ -1,8 +1,7 @@
 """Go on learning online: a DTFM from its own episodes, or an algorithm of Stable-Baselines3 by choosing its noise."""
 
-from sb3_dtfm.finetuning.hold_actor import HoldActor
 from sb3_dtfm.finetuning.noise_env import NoiseActionVecEnv, NoiseSpace
 from sb3_dtfm.finetuning.online import OnlineDTFM
 from sb3_dtfm.finetuning.steered import SteeredDTFM
 
-__all__ = ["HoldActor", "NoiseActionVecEnv", "NoiseSpace", "OnlineDTFM", "SteeredDTFM"]
+__all__ = ["NoiseActionVecEnv", "NoiseSpace", "OnlineDTFM", "SteeredDTFM"]
