@@ -25,8 +25,8 @@ from sb3_dtfm.benchmark.evaluation import FINAL_STATES, evaluate, make_seeded_en
 from sb3_dtfm.benchmark.report.runs import read_studies
 from sb3_dtfm.benchmark.rows import Cell, Row, read_rows, write_row
 from sb3_dtfm.files import read_run
+from sb3_dtfm.finetuning import STEERED
 from sb3_dtfm.recording.loading import load_agent
-from sb3_dtfm.zoo.registration import STEERED
 
 N_EPISODES, N_ENVS = 100, 10
 BEFORE = "before"
@@ -36,15 +36,15 @@ def measure(run: Path, before: Path, like: Row, label: str, output: Path) -> Non
     """
     Write rows of what a run began with, and of what it came to.
 
-    :param run: folder of a run of `finetune`
+    :param run: folder of a run of `finetune`, `--algo dtfm` or of a steered model that decides on single actions
     :param before: folder of the run that it went on from
     :param like: a row of the model before
     :param label: of the rows
     :param output: folder for the files
     """
-    if run.parent.name == STEERED:
-        raise SystemExit(f"{run}: its timesteps are decisions; rows are of runs of `finetune --algo dtfm`.")
     (folder,) = (path.parent for path in run.glob("*/config.yml"))
+    if run.parent.name == STEERED and load_agent(STEERED, run / f"{folder.name}.zip", "cpu").policy.n_action_steps > 1:
+        raise SystemExit(f"{run}: its timesteps are decisions of several actions; rows have the environment's steps.")
     settings = {key: value for key, value in read_run(folder).items() if key != "callback"}
     settings = {**like["settings"], **settings}
     envs = make_seeded_envs(like["task"], settings, N_ENVS)

@@ -23,7 +23,7 @@ ROOMS = {
     "heads": ("sb3_dtfm/heads", {"heads", "networks", "arguments"}),
     "envs": ("envs", {"envs"}),
     "data": ("sb3_dtfm/data", {"actions", "arguments", "data", "envs", "files", "windows"}),
-    "recording": ("sb3_dtfm/recording", {"recording", "actions", "algorithms", "envs", "data", "files"}),
+    "recording": ("sb3_dtfm/recording", {"recording", "actions", "algorithms", "envs", "data", "files", "finetuning"}),
     "policies": ("sb3_dtfm/policies", {"networks", "heads", "windows", "actions", "arguments", "policies"}),
     "callbacks": ("sb3_dtfm/callbacks.py", {"data"}),
     "optimization": ("sb3_dtfm/optimization.py", set()),

@@ -2,6 +2,6 @@
 
 from sb3_dtfm.finetuning.noise_env import NoiseActionVecEnv, NoiseSpace
 from sb3_dtfm.finetuning.online import OnlineDTFM
-from sb3_dtfm.finetuning.steered import SteeredDTFM
+from sb3_dtfm.finetuning.steered import STEERED, SteeredDTFM
 
-__all__ = ["NoiseActionVecEnv", "NoiseSpace", "OnlineDTFM", "SteeredDTFM"]
+__all__ = ["STEERED", "NoiseActionVecEnv", "NoiseSpace", "OnlineDTFM", "SteeredDTFM"]

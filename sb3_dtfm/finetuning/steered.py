@@ -13,6 +13,8 @@ from sb3_dtfm.finetuning.noise_env import NoiseActionVecEnv
 from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.policies.steering import ACTIVATIONS
 
+# What commands and folders of runs call it.
+STEERED = "steered"
 # Classes whose actors can be taken over, by whether they squash their actions by tanh; sb3-contrib is an extra.
 SQUASHED = {"SAC": True, "TQC": True, "PPO": False, "A2C": False, "TRPO": False}
 

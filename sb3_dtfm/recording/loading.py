@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.files import holds_pickles, read_configuration, read_run
+from sb3_dtfm.finetuning import STEERED, SteeredDTFM
 
 NOT_NORMALIZED = "none"
 
@@ -83,7 +84,7 @@ def _read_run(model: Path, run: Path) -> AgentFiles:
 @functools.cache
 def known_algorithms() -> dict[str, type[BaseAlgorithm]]:
     """Ours, Stable-Baselines3's and sb3-contrib's, by the class name in lower case, which is nearly always RL-Zoo's."""
-    known: dict[str, type[BaseAlgorithm]] = dict(ALGORITHMS)
+    known: dict[str, type[BaseAlgorithm]] = {**ALGORITHMS, STEERED: SteeredDTFM}
     for module_name in ("stable_baselines3", "sb3_contrib"):
         with contextlib.suppress(ImportError):
             members = inspect.getmembers(importlib.import_module(module_name), inspect.isclass)
@@ -137,7 +138,7 @@ def _check_algorithm(asked: type[BaseAlgorithm], model: Path) -> None:
     """
     if not holds_pickles(model):
         saved_by = str(read_configuration(model).get("algorithm"))
-        if saved_by != asked.__name__:
+        if saved_by not in (each.__name__ for each in asked.__mro__):
             raise ValueError(f"{model} was saved by {saved_by}, not by {asked.__name__} (--algo).")
         return
     try:

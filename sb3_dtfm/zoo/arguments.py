@@ -12,7 +12,8 @@ from rl_zoo3.utils import StoreDict
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.envs import register_gymnasium_robotics
-from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, STEERED, packaged_config
+from sb3_dtfm.finetuning import STEERED
+from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, packaged_config
 
 TRAIN_EXAMPLES = """\
   sb3-dtfm train --algo dtfm --env HalfCheetah-v5

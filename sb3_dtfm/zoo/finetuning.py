@@ -17,12 +17,11 @@ from sb3_dtfm.algorithms import DTFM
 from sb3_dtfm.arguments import with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.files import read_run
-from sb3_dtfm.finetuning import NoiseActionVecEnv, OnlineDTFM, SteeredDTFM
+from sb3_dtfm.finetuning import STEERED, NoiseActionVecEnv, OnlineDTFM, SteeredDTFM
 from sb3_dtfm.finetuning.noise_env import STEERED_SOLVER_STEPS
 from sb3_dtfm.finetuning.online import ACCEPTED
 from sb3_dtfm.zoo.arguments import UsageError
 from sb3_dtfm.zoo.manager import OF_RL_ZOO, OfflineExperimentManager
-from sb3_dtfm.zoo.registration import STEERED
 from sb3_dtfm.zoo.resuming import EPISODES
 
 # The key of the settings of a NoiseActionVecEnv in a run's config.yml, where `enjoy` must not find a wrapper.

@@ -11,11 +11,9 @@ from rl_zoo3.utils import ALGOS
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.envs import register_gymnasium_robotics
-from sb3_dtfm.finetuning import SteeredDTFM
+from sb3_dtfm.finetuning import STEERED, SteeredDTFM
 from sb3_dtfm.policies import SequencePolicy
 
-# What RL-Zoo calls a DTFM that an online algorithm steers: a folder of the logs, and `enjoy --algo`.
-STEERED = "steered"
 # What `finetune --algo` calls a DTFM that goes on by itself; its run is one of this algorithm, as any other.
 ONLINE = "dtfm"
 # Where settings of the online algorithms are.

@@ -54,6 +54,9 @@ def test_a_run_is_finetuned_and_played(run, workplace, capsys):
         command = ["enjoy", "--algo", "steered", "--env", "HalfCheetah-v5", "--no-render", "-n", "45"]
         assert main([*command, *more]) == 0
         assert "Episode Length 20" in capsys.readouterr().out
+    recording = ["--model", str(steered), "--episodes", "2", "--dataset-id", "local/steered-v0"]
+    assert main(["record", "--algo", "steered", "--env", "HalfCheetah-v5", *recording]) == 0
+    assert load_dataset("local/steered-v0").episode_lengths.tolist() == [20, 20]
 
 
 def test_the_curve_begins_at_the_offline_policys_score(run, workplace):

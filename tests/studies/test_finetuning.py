@@ -2,6 +2,7 @@
 
 import finetuning
 import numpy as np
+import pytest
 
 from sb3_dtfm.benchmark.report.runs import read_studies
 from sb3_dtfm.benchmark.rows import Cell, read_rows
@@ -35,3 +36,23 @@ def test_a_run_is_measured_and_shown(workplace):
     assert seconds[-1] > 0
     finetuning.plot(workplace / "rows", ["own"], workplace / "curves.png")
     assert (workplace / "curves.png").stat().st_size > 5000
+
+
+def test_a_steered_run_is_measured_where_its_decisions_are_steps(workplace):
+    for chunk_size, number in ((1, 1), (4, 2)):
+        settings = f"policy_kwargs:dict(embed_dim=16,n_layers=1,n_heads=1,flow_hidden_dim=16,chunk_size={chunk_size})"
+        assert main(tiny_training("dtfm", "dataset:" + repr(DATASET_ID), settings)) == 0
+        before = workplace / f"logs/dtfm/HalfCheetah-v5_{number}"
+        quick = ["-params", "learning_starts:10", "batch_size:8", "gradient_steps:1", "policy_kwargs:dict(net_arch=[16])"]
+        command = ["finetune", "--algo", "sac", "--env", "HalfCheetah-v5", "--model", str(before), "-n", "40", *quick]
+        assert main([*command, "--eval-freq", "20", "--eval-episodes", "3"]) == 0
+    (workplace / "rows").mkdir()
+    cell = Cell("HalfCheetah-v5", 1.0, "dtfm", 0, "tiny")
+    like = dict(cell._asdict(), settings={"batch_size": 4}, data={"n_episodes": 3}, solver="euler", n_solver_steps=1)
+    steered = workplace / "logs/steered"
+    finetuning.measure(steered / "HalfCheetah-v5_1", before, like, "steered", workplace / "rows")
+    rows = read_rows(workplace / "rows" / f"{cell._replace(label='steered').file_name}.jsonl")
+    assert [row["step"] for row in rows] == [0, 20, 40, 40]
+    assert rows[-1]["settings"]["noise_env"]["algorithm"] == "sac"
+    with pytest.raises(SystemExit, match="its timesteps are decisions of several actions"):
+        finetuning.measure(steered / "HalfCheetah-v5_2", before, like, "steered", workplace / "rows")
