@@ -14,7 +14,7 @@ from sb3_dtfm.finetuning import OnlineDTFM, SteeredDTFM
 from tests.recorded import DATASET_ID, tiny_training
 
 EVALUATIONS = ["--eval-freq", "10", "--eval-episodes", "2"]
-QUICK = ["learning_starts:10", "batch_size:8", "gradient_steps:1", "policy_kwargs:dict(net_arch=[16])"]
+QUICK = ["n_envs:1", "learning_starts:10", "batch_size:8", "gradient_steps:1", "policy_kwargs:dict(net_arch=[16])"]
 FINETUNE = ["finetune", "--env", "HalfCheetah-v5", "-n", "24", "--seed", "1", *EVALUATIONS]
 
 
