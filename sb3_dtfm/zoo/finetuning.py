@@ -3,6 +3,7 @@
 import inspect
 import os
 import shutil
+import signal
 from collections import OrderedDict
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from sb3_dtfm.finetuning.noise_env import STEERED_SOLVER_STEPS
 from sb3_dtfm.finetuning.online import ACCEPTED
 from sb3_dtfm.zoo.arguments import UsageError
 from sb3_dtfm.zoo.manager import OF_RL_ZOO, OfflineExperimentManager
-from sb3_dtfm.zoo.resuming import EPISODES
+from sb3_dtfm.zoo.resuming import EPISODES, StopSignals
 
 # The key of the settings of a NoiseActionVecEnv in a run's config.yml, where `enjoy` must not find a wrapper.
 NOISE_ENV = "noise_env"
@@ -41,11 +42,13 @@ class SteeredCallbacks(BaseCallback):
     :param steered: acts by the algorithm's actor whenever it is looked at
     :param callbacks: to run with it
     :param seed: of the run, which evaluations are seeded by
+    :param signals: where one has interrupted the training, the end is not evaluated: what there is is to be saved at once
     """
 
-    def __init__(self, steered: SteeredDTFM, callbacks: list[BaseCallback], seed: int) -> None:
+    def __init__(self, steered: SteeredDTFM, callbacks: list[BaseCallback], seed: int, signals: StopSignals) -> None:
         super().__init__()
         self.steered = steered
+        self.signals = signals
         self.evaluations = [each for each in callbacks if isinstance(each, EvalCallback)]
         at_ends = EvaluateAtStartAndEnd(self.evaluations)
         self.inner = CallbackList([SeedEvaluations(self.evaluations, seed), *callbacks, at_ends])
@@ -71,7 +74,8 @@ class SteeredCallbacks(BaseCallback):
 
     def _on_training_end(self) -> None:
         self._take_over()
-        self.inner.on_training_end()
+        if not self.signals.asked:  # RL-Zoo calls this after an interrupt, too
+            self.inner.on_training_end()
 
     def _looking(self) -> list[tuple[BaseCallback, int]]:
         """Those of the callbacks that look at the model now and then, and how often."""
@@ -189,7 +193,7 @@ class SteeringManager(FinetuningManager):
             each for each in self.callbacks if isinstance(each, EvalCallback | CheckpointCallback)
         ]
         others = [each for each in self.callbacks if each not in of_the_model]
-        self.callbacks = [*others, SteeredCallbacks(self.steered, of_the_model, self.seed)]
+        self.callbacks = [*others, SteeredCallbacks(self.steered, of_the_model, self.seed, self.signals)]
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """
@@ -211,6 +215,7 @@ class SteeringManager(FinetuningManager):
         The steered model where RL-Zoo looks for one, and the algorithm beside it, to go on with.
 
         :param model: the online algorithm
+        :raises SystemExit: SIGTERM has ended the run
         """
         print(f"Saving to {self.save_path}")
         if has_learned(model):
@@ -219,6 +224,12 @@ class SteeringManager(FinetuningManager):
         model.save(os.path.join(self.save_path, AGENT))
         if self.save_replay_buffer and isinstance(model, OffPolicyAlgorithm):
             model.save_replay_buffer(os.path.join(self.save_path, "replay_buffer.pkl"))
+        if self.signals.asked:
+            print(
+                f"Interrupted after {model.num_timesteps} decisions; -i {self.save_path}/{AGENT}.zip goes on in a new run."
+            )
+        if self.signals.terminated:
+            raise SystemExit(128 + signal.SIGTERM)
 
 
 class OnlineManager(FinetuningManager):

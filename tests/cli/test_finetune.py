@@ -68,6 +68,26 @@ def test_the_curve_begins_at_the_offline_policys_score(run, workplace):
     assert SteeredDTFM.load(steered / "best_model").steering is None
 
 
+def test_steering_that_is_interrupted_is_saved_at_once(run, workplace, capsys, monkeypatch):
+    """Not after an evaluation, which takes minutes: who sends SIGTERM kills what has not ended soon."""
+    train = SAC.train
+
+    def interrupted(self, *args, **kwargs):
+        train(self, *args, **kwargs)
+        if self.num_timesteps == 14:
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(SAC, "train", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        main([*FINETUNE, "--model", str(run), "-params", *QUICK])
+    assert ended.value.code == 128 + signal.SIGTERM
+    steered = workplace / "logs/steered/HalfCheetah-v5_1"
+    assert np.load(steered / "evaluations.npz")["timesteps"].tolist() == [0, 10]
+    assert "Interrupted after 14 decisions; -i logs/steered/HalfCheetah-v5_1/agent.zip" in capsys.readouterr().out
+    model, agent = SteeredDTFM.load(steered / "HalfCheetah-v5"), SAC.load(steered / "agent")
+    np.testing.assert_array_equal(agent.actor.mu.weight.detach(), model.policy.steering.mean.weight)
+
+
 def test_a_model_that_acts_by_its_mean_action_draws_when_it_is_steered(run, workplace, capsys):
     """As gaits are packaged: there noise would change nothing."""
     model = DTFM.load(run / "HalfCheetah-v5")
