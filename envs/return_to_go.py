@@ -9,6 +9,8 @@ from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, is_vecenv_wrapped, unwrap_vec_normalize
 
+from sb3_dtfm.envs.success import reported_success
+
 OBSERVATION = "observation"
 RETURN_TO_GO = "return_to_go"
 TIMESTEP = "timestep"
@@ -101,6 +103,9 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     added up, and `info` has the observations between them, stacked by key, under `BETWEEN`. So whoever decides once for
     several steps does so in each of many parallel environments at its own place in its episode.
 
+    A task that tells of success by another name, as Adroit's hands do, tells it as `is_success` too, which SB3's
+    `EvalCallback` and logs know.
+
     :param env: the environment to wrap
     :param target_return: return to ask for in each episode, environment reward units
     :raises ValueError: `target_return` is not a finite number, or the observation space cannot be flattened
@@ -138,6 +143,9 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._return_to_go -= float(reward)
         self._timestep += 1
+        success = reported_success(info)
+        if success is not None and "is_success" not in info:  # by which SB3 counts
+            info = {**info, "is_success": success}
         return self._observe(observation), reward, terminated, truncated, info
 
     def _step_through(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:

@@ -201,3 +201,28 @@ def test_replaying_a_recording_shows_exactly_the_return_to_go_of_the_buffer(
             assert np.float32(reward) == buffer.rewards[row].item()
             row += 1
         assert (terminated, truncated) == (buffer.terminated[index], buffer.truncated[index])
+
+
+class TellsOfSuccess(gym.Wrapper):
+    def __init__(self, env: gym.Env, info: dict[str, Any]) -> None:
+        super().__init__(env)
+        self.info = info
+
+    def step(self, action: Any) -> tuple:
+        return *self.env.step(action)[:4], self.info
+
+
+@pytest.mark.parametrize(
+    ("told", "shown"),
+    [
+        ({"success": np.True_}, {"success": True, "is_success": True}),
+        ({"success": 1.0, "is_success": False}, {"success": 1.0, "is_success": False}),
+        ({"other": 1}, {"other": 1}),
+    ],
+)
+def test_success_has_the_name_that_sb3_counts_by(told, shown):
+    env = ReturnToGoWrapper(TellsOfSuccess(ConstantReward(spaces.Box(-1, 1, (2,)), np.zeros(2)), told), 1.0)
+    env.reset()
+    *_, info = env.step(np.zeros(1))
+    assert info == shown
+    assert "is_success" not in told or told["is_success"] is False, "the environment's own is left alone"
