@@ -67,7 +67,7 @@ def environment_steps(run: Path) -> np.ndarray:
     lines = [line for path in run.glob("*.monitor.csv") for line in path.read_text().splitlines()[2:]]
     ends = np.array(
         sorted((float(seconds), float(length)) for _, length, seconds in (line.split(",")[:3] for line in lines))
-    )
+    ).reshape(-1, 2)
     ends[:, 1] = np.cumsum(ends[:, 1])
     return np.concatenate([np.zeros((1, 2)), ends])
 

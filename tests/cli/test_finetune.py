@@ -42,7 +42,7 @@ def test_a_run_is_finetuned_and_played(run, workplace, capsys):
         "layers": [16],
         "activation": "ReLU",
         "squashed": True,
-        "bound": 1.5,
+        "bound": 0.7,
         "hidden_state": False,
     }
     assert (first.policy.steering.mean.weight != last.policy.steering.mean.weight).any()

@@ -43,7 +43,14 @@ def test_a_steered_run_is_measured_where_its_decisions_are_steps(workplace):
         settings = f"policy_kwargs:dict(embed_dim=16,n_layers=1,n_heads=1,flow_hidden_dim=16,chunk_size={chunk_size})"
         assert main(tiny_training("dtfm", "dataset:" + repr(DATASET_ID), settings)) == 0
         before = workplace / f"logs/dtfm/HalfCheetah-v5_{number}"
-        quick = ["-params", "learning_starts:10", "batch_size:8", "gradient_steps:1", "policy_kwargs:dict(net_arch=[16])"]
+        quick = [
+            "-params",
+            "n_envs:1",
+            "learning_starts:10",
+            "batch_size:8",
+            "gradient_steps:1",
+            "policy_kwargs:dict(net_arch=[16])",
+        ]
         command = ["finetune", "--algo", "sac", "--env", "HalfCheetah-v5", "--model", str(before), "-n", "40", *quick]
         assert main([*command, "--eval-freq", "20", "--eval-episodes", "3"]) == 0
     (workplace / "rows").mkdir()
