@@ -1,0 +1,111 @@
+"""Recorded episodes become the flat arrays of a buffer, each checked on the way."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+from sb3_dtfm.actions import ActionSpace, to_vectors, vector_space
+from sb3_dtfm.data.episodes import EpisodeTable, moments
+from sb3_dtfm.data.storage import FileStorage, MemoryStorage
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_space, check_size, check_trajectory
+
+# What may become of an episode that is refused.
+ON_INVALID = ("raise", "drop")
+
+
+def collect(
+    trajectories: Iterable[Trajectory],
+    action_space: ActionSpace,
+    observation_space: spaces.Box | None,
+    n_steps: int | None,
+    source: str,
+    storage: MemoryStorage | FileStorage,
+    on_invalid: str,
+    n_stored: int | None,
+) -> tuple[dict[str, th.Tensor], EpisodeTable, spaces.Box, tuple[int, str] | None]:
+    """
+    Arguments are those of :meth:`TrajectoryBuffer.from_trajectories`.
+
+    :return: the flat tensors, a row for each episode, the observation space, and what the buffer tells of dropped episodes
+    :raises DatasetError: as there
+    """
+    if on_invalid not in ON_INVALID:
+        raise DatasetError(f"on_invalid must be one of {', '.join(ON_INVALID)}, got {on_invalid!r}.")
+    action_space = check_action_space(action_space, source)
+    n_action_numbers = vector_space(action_space).shape[0]
+    if n_steps is None and isinstance(trajectories, Sequence):
+        n_steps = sum(map(len, trajectories))
+    storage.reserve(n_steps or 0)
+    rows: list[tuple] = []
+    dropped: list[DatasetError] = []
+    start = 0
+
+    def check(trajectory: Trajectory) -> np.ndarray:
+        nonlocal observation_space
+        space = observation_space or spaces.Box(-np.inf, np.inf, np.shape(trajectory.observations)[1:], np.float32)
+        to_go = check_trajectory(trajectory, space, action_space, source)
+        if n_stored is not None:
+            n_rows, n_columns = max(n_steps or 0, start + len(trajectory)), space.shape[0] + n_action_numbers + 2
+            check_size(4 * n_rows * n_columns, n_stored, f"{source}: {n_rows} steps")
+        observation_space = space
+        return to_go
+
+    for trajectory, to_go in _checked(trajectories, check, dropped, on_invalid):
+        storage.append(
+            {
+                "observations": trajectory.observations,
+                "actions": to_vectors(trajectory.actions, action_space),
+                "rewards": trajectory.rewards,
+                "returns_to_go": to_go,
+            }
+        )
+        rows.append(_episode_row(trajectory, start, to_go))
+        start += len(trajectory)
+    if observation_space is None or not rows:
+        left = f" that could be kept of {len(dropped)} (the first: {dropped[0]})" if dropped else ""
+        raise DatasetError(f"{source}: holds no episode{left}; at least one is needed.")
+    tensors = storage.finish()
+    episodes = EpisodeTable(*(np.array(column) for column in zip(*rows, strict=True)))
+    return tensors, episodes, observation_space, (len(dropped), str(dropped[0])) if dropped else None
+
+
+def _checked(
+    trajectories: Iterable[Trajectory],
+    check: Callable[[Trajectory], np.ndarray],
+    dropped: list[DatasetError],
+    on_invalid: str,
+) -> Iterator[tuple[Trajectory, np.ndarray]]:
+    """
+    Episodes that pass a check, each with what the check made of it.
+
+    :param dropped: gets the reason for each other one, where `on_invalid` is "drop"
+    """
+    iterator = iter(trajectories)
+    while True:
+        try:
+            trajectory = next(iterator)
+            checked = check(trajectory)
+        except StopIteration:
+            return
+        except DatasetError as error:
+            if on_invalid == "raise":
+                raise
+            dropped.append(error)
+        else:
+            yield trajectory, checked
+
+
+def _episode_row(trajectory: Trajectory, start: int, to_go: np.ndarray) -> tuple:
+    """A row of an `EpisodeTable`."""
+    return (
+        start,
+        len(trajectory),
+        to_go[0],  # the return: the sum of all rewards in float64
+        trajectory.terminated,
+        trajectory.truncated,
+        np.nan if trajectory.success is None else float(trajectory.success),
+        *moments(trajectory.observations),
+        max(to_go.max(), -to_go.min()),
+    )
