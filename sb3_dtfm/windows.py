@@ -116,6 +116,17 @@ def check_context(state: Any, nothing: Context) -> Context:
     return Context(*state)
 
 
+def check_episode_start(episode_start: Any, n_rows: int) -> np.ndarray:
+    """
+    :return: (B,) bool, or (1,) for all rows alike
+    :raises ValueError: not one for each row, nor one for all
+    """
+    starts = np.asarray(episode_start, dtype=bool).reshape(-1)
+    if len(starts) not in (1, n_rows):
+        raise ValueError(f"episode_start has shape {np.shape(episode_start)}; ({n_rows},) is expected.")
+    return starts
+
+
 def restarts(context: Context, timestep: np.ndarray, episode_start: np.ndarray | None = None) -> np.ndarray:
     """
     Where a new step begins a context of its own: at the start of an episode, and where it follows nothing.

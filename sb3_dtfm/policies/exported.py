@@ -8,8 +8,9 @@ from gymnasium import spaces
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_dtfm.policies.network import SequenceNetwork
 from sb3_dtfm.policies.normalization import Normalization
-from sb3_dtfm.policies.sequence import SequenceNetwork, SequencePolicy
+from sb3_dtfm.policies.sequence import SequencePolicy
 from sb3_dtfm.policies.steering import steering_observation
 from sb3_dtfm.windows import Windows
 
