@@ -17,19 +17,8 @@ from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dtfm.actions import ActionSpace, bounds_of
-from sb3_dtfm.algorithms.saving import (
-    CRITIC_OPTIMIZER,
-    CRITIC_PREFIX,
-    OPTIMIZER,
-    POLICY,
-    UnsavedSchedule,
-    check_policy,
-    from_configuration,
-    naming_the_file,
-    optimizer_state,
-    optimizer_tensors,
-    to_configuration,
-)
+from sb3_dtfm.algorithms.loading import check_sizes, from_file, parameters
+from sb3_dtfm.algorithms.saving import OPTIMIZER, POLICY, UnsavedSchedule, optimizer_tensors, optimizers, to_configuration
 from sb3_dtfm.arguments import (
     BOOLEAN,
     COUNT,
@@ -44,7 +33,7 @@ from sb3_dtfm.arguments import (
 from sb3_dtfm.data import Dataset, DatasetError, ScoreReference, TrajectoryBuffer, check_action_space, load_dataset
 from sb3_dtfm.distributed import check_batch_size, first_of_each_machine_first, is_first_process
 from sb3_dtfm.envs import check_vec_env, return_to_go_space
-from sb3_dtfm.files import ModelFile, ModelFileError, file_name, holds_pickles, read_model, write_model, write_onnx
+from sb3_dtfm.files import ModelFile, file_name, holds_pickles, read_model, write_model, write_onnx
 from sb3_dtfm.optimization import LEARNING_RATE_SCHEDULES, PRECISIONS, RunningMeans
 from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.policies.exported import ExportedPolicy
@@ -360,70 +349,11 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         if allow_pickle and holds_pickles(path):
             model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
         else:
-            model = cls._from_file(path, device, custom_objects or {}, print_system_info, kwargs)
+            model = from_file(cls, path, device, custom_objects or {}, print_system_info, kwargs)
         model.policy.set_weight_decay(model.weight_decay)  # the optimiser's state in the file brings that of its own
         if env is not None:
             model.set_env(env, force_reset)
         return model
-
-    @classmethod
-    def _from_file(
-        cls: type[SelfAlgorithm],
-        path: str | Path | io.BufferedIOBase,
-        device: th.device | str,
-        custom_objects: dict[str, Any],
-        print_system_info: bool,
-        changed: dict[str, Any],
-    ) -> SelfAlgorithm:
-        """A model of what the file says, and of attributes that are changed."""
-        source = file_name(path)
-        configuration, tensors = read_model(path, {POLICY, OPTIMIZER}, get_device(device), print_system_info)
-        attributes = from_configuration(cls, configuration, custom_objects, source)
-        if changed.get("policy_kwargs", attributes.get("policy_kwargs")) != attributes.get("policy_kwargs"):
-            raise ValueError(
-                f"policy_kwargs are what the weights of {source} were made with, {attributes.get('policy_kwargs')}, and "
-                f"cannot be changed: got {changed['policy_kwargs']}."
-            )
-        model = cls(attributes["policy_class"], device=device, _init_setup_model=False)
-        if attributes.get("steering") is not None and not hasattr(model, "steering"):
-            raise ModelFileError(f"{source} is a DTFM with its steering; sb3_dtfm.finetuning.SteeredDTFM loads it.")
-        vars(model).update(attributes)
-        with naming_the_file(source):
-            model._check_sizes(tensors[POLICY], source)
-        vars(model).update(changed)
-        model._setup_model()
-        with naming_the_file(source):
-            model.set_parameters(model._parameters(tensors, source), device=device)
-        return model
-
-    def _check_sizes(self, tensors: dict[str, th.Tensor], source: str) -> None:
-        """
-        See :func:`~sb3_dtfm.algorithms.saving.check_policy`.
-
-        :raises ModelFileError: more layers than there are tensors, or others than these settings make
-        """
-        self._check_arguments(learning_rate=NOT_NEGATIVE)
-        for name, value in (self.policy_kwargs or {}).items():
-            if name.endswith("n_layers") and isinstance(value, int) and value > len(tensors):
-                raise ModelFileError(f"{source}: policy_kwargs say {name}={value}, and there are {len(tensors)} tensors.")
-        self._setup_lr_schedule()
-        with th.device("meta"):
-            check_policy(self._make_policy(ema=False), tensors, source)
-
-    def _parameters(self, tensors: dict[str, dict[str, th.Tensor]], source: str) -> Any:
-        """What :meth:`set_parameters` takes, from the tensors of a file."""
-        loaded: dict[str, Any] = {POLICY: tensors[POLICY]}
-        states = dict(tensors[OPTIMIZER])
-        for name, (optimizer, prefix) in reversed(self._optimizers().items()):  # all that are not the critic's: the policy's
-            own = {key[len(prefix) :]: states.pop(key) for key in list(states) if key.startswith(prefix)}
-            loaded[name] = optimizer_state(optimizer, own, source)
-        return loaded
-
-    def _optimizers(self) -> dict[str, tuple[th.optim.Optimizer, str]]:
-        """By the name that SB3 finds them by, each with how the names of its tensors begin in a file."""
-        critic = self.policy.critic
-        own = {OPTIMIZER: (self.policy.optimizer, "")}
-        return own if critic is None else {**own, CRITIC_OPTIMIZER: (critic.optimizer, CRITIC_PREFIX)}
 
     def set_parameters(
         self,
@@ -442,8 +372,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         if not isinstance(load_path_or_dict, dict):
             source = file_name(load_path_or_dict)
             _, tensors = read_model(load_path_or_dict, {POLICY, OPTIMIZER}, get_device(device))
-            self._check_sizes(tensors[POLICY], source)
-            load_path_or_dict = self._parameters(tensors, source)
+            check_sizes(self, tensors[POLICY], source)
+            load_path_or_dict = parameters(self.policy, tensors, source)
         super().set_parameters(load_path_or_dict, exact_match, device)
 
     def save(
@@ -467,10 +397,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
             return
         wanted = set(include or ())
         left_out = {*self._excluded_save_params(), *(exclude or ())} - wanted
-        parameters = self.get_parameters()
-        tensors = {POLICY: parameters[POLICY], OPTIMIZER: {}}
-        for optimizer, prefix in self._optimizers().values():
-            tensors[OPTIMIZER] |= {f"{prefix}{name}": value for name, value in optimizer_tensors(optimizer).items()}
+        tensors = {POLICY: self.get_parameters()[POLICY], OPTIMIZER: optimizer_tensors(self.policy)}
         write_model(path, ModelFile(to_configuration(self, left_out, wanted), tensors))
         self._last_saved = file_name(path)
 
@@ -513,4 +440,4 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         return [*super()._excluded_save_params(), *of_an_environment, *made_anew]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return [POLICY, *self._optimizers()], []
+        return [POLICY, *optimizers(self.policy)], []
