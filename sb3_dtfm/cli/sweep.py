@@ -2,6 +2,7 @@
 
 import argparse
 import functools
+import itertools
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -68,7 +69,7 @@ def main(argv: Sequence[str]) -> None:
             reached.append(sweep(model, agent, options, targets, progress))
     names = [f"{algo.upper()}, {Path(model).stem}" for algo, model in zip(algorithms, options.models, strict=True)]
     if len(set(names)) < len(names):
-        names = [f"{i}: {model}" for i, model in enumerate(options.models, 1)]
+        names = [f"{i}: {name}" for i, name in enumerate(distinguished(options.models), 1)]
     curves = dict(zip(names, reached, strict=True))
     print("\n".join(table(curves)))
     picture = draw(curves, returns, Path(options.output), options.env)
@@ -176,6 +177,20 @@ def sweep(
         reached.append(Asked(target, episodes.returns))
     vec_env.close()
     return reached
+
+
+def distinguished(paths: Sequence[str]) -> list[str]:
+    """Paths without the folders in which all of them lie and the parts by which all of them end; one part at least."""
+    parts = [Path(path).parts for path in paths]
+    shortest = min(map(len, parts))
+    n_first = min(_n_alike(parts), shortest - 1)
+    n_last = min(_n_alike([each[::-1] for each in parts]), shortest - n_first - 1)
+    return [str(Path(*each[n_first : len(each) - n_last])) for each in parts]
+
+
+def _n_alike(sequences: Sequence[Sequence[str]]) -> int:
+    """How many elements all of them begin with."""
+    return sum(1 for _ in itertools.takewhile(lambda place: len(set(place)) == 1, zip(*sequences, strict=False)))
 
 
 def first_state(options: argparse.Namespace) -> int:

@@ -9,7 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from sb3_dtfm.cli.main import main
-from sb3_dtfm.cli.sweep import Asked, draw, evenly, table
+from sb3_dtfm.cli.sweep import Asked, distinguished, draw, evenly, table
 from tests.recorded import DATASET_ID, tiny_training
 
 SWEEP = ["--env", "HalfCheetah-v5", "--dataset", DATASET_ID, "--episodes", "2", "--env-kwargs", "max_episode_steps:20"]
@@ -55,6 +55,14 @@ def test_two_models_are_asked_for_the_range_of_their_data(workplace, capsys):
     assert "--acting: n_solver_steps" in errors
     accepted = "kv_cache, n_action_steps, n_candidates, temperature, solver, n_solver_steps"
     assert f"--acting: speed: no way of acting; accepted are {accepted}." in errors
+
+
+def test_long_paths_are_named_by_what_tells_them_apart():
+    """A table and a legend have to hold them."""
+    runs = [f"logs/can_seed{seed}/attempt-{seed}/dtfm/Can-v0.zip" for seed in (0, 1)]
+    assert distinguished(runs) == ["can_seed0/attempt-0", "can_seed1/attempt-1"]
+    assert distinguished(["a/model.zip", "a/model.zip"]) == ["model.zip", "model.zip"]
+    assert distinguished(["model.zip", "runs/model.zip"]) == ["model.zip", "runs/model.zip"]
 
 
 @pytest.mark.parametrize(
