@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from sb3_dtfm.algorithms import ALGORITHMS
-from sb3_dtfm.zoo.arguments import UsageError
+from sb3_dtfm.zoo.arguments import UsageError, with_policy_options
 from sb3_dtfm.zoo.registration import packaged_config, policy_of
 
 WRAPPER = "sb3_dtfm.envs.ReturnToGoWrapper"
@@ -91,10 +91,11 @@ def task_settings(
     :param task: the task and its data
     :param regime: share of the episodes
     :param n_timesteps: gradient steps, None for the profile's
-    :param hyperparams: replace the profile's; `policy_kwargs` replace entry by entry
+    :param hyperparams: replace the profile's; `policy_kwargs` replace entry by entry, and may stand beside the others
     :raises UsageError: settings missing, unknown or not allowed here
     """
     settings = read_profile(profile, algo, task.env_id)
+    hyperparams = with_policy_options(hyperparams)
     policy_kwargs = {**_policy_kwargs(settings), **_policy_kwargs(hyperparams)}
     settings.update(hyperparams)
     for key in GRID_KEYS:

@@ -6,6 +6,7 @@ import inspect
 import os
 import shutil
 import signal
+from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,7 +21,7 @@ from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.arguments import with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.distributed import is_first_process
-from sb3_dtfm.zoo.arguments import UsageError
+from sb3_dtfm.zoo.arguments import UsageError, with_policy_options
 from sb3_dtfm.zoo.resuming import CHECKPOINT, KeepCheckpoint, ReplaceEvaluations, Start, StopSignals, go_on
 
 # Keys of its YAML files that no algorithm sees.
@@ -59,6 +60,14 @@ class OfflineExperimentManager(ExperimentManager):
                 self.save_path, self.params_path = str(resumed), str(resumed / self.env_name)
             self.trained_agent = str(resumed / CHECKPOINT)
             self.continue_training = (resumed / CHECKPOINT).is_file()  # else it was killed before the first one
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """RL-Zoo's; options of the policy may stand beside the algorithm's."""
+        hyperparams, saved = super().read_hyperparameters()
+        if self.algo not in ALGORITHMS:
+            return hyperparams, saved
+        hyperparams = with_policy_options(hyperparams)
+        return hyperparams, OrderedDict(sorted(hyperparams.items()))
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """RL-Zoo's, which makes the run's folder before its model."""

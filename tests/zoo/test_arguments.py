@@ -5,8 +5,11 @@ import argparse
 import pytest
 from rl_zoo3.utils import StoreDict
 
-from sb3_dtfm.zoo.arguments import UsageError, enjoy_arguments, train_arguments
+from sb3_dtfm import DTFM
+from sb3_dtfm.cli.main import main
+from sb3_dtfm.zoo.arguments import UsageError, enjoy_arguments, train_arguments, with_policy_options
 from sb3_dtfm.zoo.registration import packaged_config
+from tests.recorded import DATASET_ID, tiny_training
 
 ENV = ["--env", "Ant-v5"]
 
@@ -87,3 +90,30 @@ def test_enjoy_looks_where_train_writes():
     assert enjoy_arguments(["--algo", "dtfm", "--env", "E"])[-2:] == ["--folder", "logs"]
     assert enjoy_arguments(["--algo", "dtfm", "-f", "mine"]) == ["--algo", "dtfm", "-f", "mine"]
     assert enjoy_arguments(["--algo", "sac"]) == ["--algo", "sac"]
+
+
+def test_options_of_the_policy_stand_among_the_others():
+    settings = {"n_timesteps": 3, "critic_steps": 4, "chunk_size": 2, "policy_kwargs": {"chunk_size": 8, "embed_dim": 16}}
+    nested = {"n_timesteps": 3, "policy_kwargs": {"critic_steps": 4, "chunk_size": 2, "embed_dim": 16}}
+    assert with_policy_options(settings) == nested
+    assert with_policy_options({"critic_steps": 4}) == {"policy_kwargs": {"critic_steps": 4}}
+    for alone in ({"n_timesteps": 3}, nested):
+        assert with_policy_options(alone) == alone
+    with pytest.raises(UsageError, match="critic_steps: policy_kwargs is 'dict\\(\\)', no mapping"):
+        with_policy_options({"critic_steps": 4, "policy_kwargs": "dict()"})
+
+
+def test_a_run_has_the_options_of_its_policy_and_the_settings_files_others(workplace, capsys):
+    (workplace / "mine.yml").write_text(
+        "HalfCheetah-v5:\n  policy: MultiInputPolicy\n  n_timesteps: 4\n  batch_size: 4\n"
+        f"  dataset: {DATASET_ID}\n  env_wrapper: [{{sb3_dtfm.envs.ReturnToGoWrapper: {{target_return: 5}}}}]\n"
+        "  policy_kwargs: {embed_dim: 16, n_layers: 1, n_heads: 1, flow_hidden_dim: 16, flow_n_layers: 1}\n"
+    )
+    command = [*tiny_training("dtfm")[:9], "--conf-file", "mine.yml", "--eval-freq", "-1", "-params"]
+    assert main([*command, "critic_steps:1", "n_candidates:3"]) == 0
+    model = DTFM.load(workplace / "logs/dtfm/HalfCheetah-v5_1/HalfCheetah-v5")
+    assert model.policy_kwargs.items() >= {"embed_dim": 16, "critic_steps": 1, "n_candidates": 3}.items()
+    assert model.policy.critic is not None
+    assert "critic_steps" in (workplace / "logs/dtfm/HalfCheetah-v5_1/HalfCheetah-v5/config.yml").read_text()
+    assert main([*command, "flow_layers:1"]) == 2
+    assert "flow_layers" in capsys.readouterr().err
