@@ -5,8 +5,8 @@ What an arm may learn from attempts of its own: Can, from ten demonstrations (do
     python studies/own_episodes.py weigh EPISODES.npz -o weighted.npz
     python studies/own_episodes.py turns MODEL --turns 12 -o turns.zip
 
-`gather` has models attempt episodes and writes the ten demonstrations and what succeeded; `weigh` repeats successes whose
-neighbours fail; both are learned from anew by
+`gather` has models attempt episodes and writes the ten demonstrations and what succeeded, or with `--failures` all; `weigh`
+repeats successes whose neighbours fail; both are learned from anew by
 
     sb3-dtfm benchmark --dataset robosuite/Can-v0=FILE --env robosuite/Can-v0 --fractions 1 --target-return 1 --algo dtfm \
         --final-episodes 100
@@ -104,7 +104,7 @@ def gather(options: argparse.Namespace) -> None:
         assert model.own is not None
         print(f"{path}: {model.own.successes.sum():.0f} of {model.own.n_episodes} solved", flush=True)
         model.own.action_space = found[0].action_space  # a file's is of single precision, as its bounds
-        found.append(model.own.select(np.flatnonzero(model.own.successes == 1.0)))
+        found.append(model.own if options.failures else model.own.select(np.flatnonzero(model.own.successes == 1.0)))
         envs.close()
     TrajectoryBuffer.join(found, [1.0] * len(found)).save(options.output)
 
@@ -149,6 +149,7 @@ def main() -> None:
         if command is gather:
             sub.add_argument("models", nargs="+", type=Path)
             sub.add_argument("--episodes", type=int, default=60)
+            sub.add_argument("--failures", action="store_true", help="keep them as well, for a critic")
         elif command is weigh:
             sub.add_argument("episodes", type=Path)
         else:
