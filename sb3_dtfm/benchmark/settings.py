@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import yaml
 
 from sb3_dtfm.algorithms import ALGORITHMS
-from sb3_dtfm.zoo.arguments import UsageError, with_policy_options
-from sb3_dtfm.zoo.registration import packaged_config, policy_of
+from sb3_dtfm.zoo.arguments import UsageError
+from sb3_dtfm.zoo.registration import packaged_config, policy_of, with_policy_options
 
 WRAPPER = "sb3_dtfm.envs.ReturnToGoWrapper"
 PROFILES = {"paper": None, "small": "small"}

@@ -13,7 +13,7 @@ from rl_zoo3.utils import StoreDict
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.envs import register_gymnasium_robotics
 from sb3_dtfm.finetuning import STEERED
-from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, packaged_config, policy_of
+from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, packaged_config
 
 TRAIN_EXAMPLES = """\
   sb3-dtfm train --algo dtfm --env HalfCheetah-v5
@@ -180,21 +180,3 @@ def enjoy_arguments(argv: Sequence[str]) -> list[str]:
     if options.algo in (*ALGORITHMS, STEERED) and options.folder is None:
         return [*argv, "--folder", "logs"]
     return list(argv)
-
-
-def with_policy_options(settings: dict[str, Any]) -> dict[str, Any]:
-    """
-    Settings in which options of a policy, as `-params critic_steps:10` gives them, are entries of the `policy_kwargs`.
-
-    :param settings: arguments of an algorithm, and what RL-Zoo knows beside them
-    :raises UsageError: the `policy_kwargs` are no mapping
-    """
-    names = set.union(*(policy_of(algo).parameter_names() for algo in ALGORITHMS))
-    options = {name: value for name, value in settings.items() if name in names}
-    if not options:
-        return settings
-    policy_kwargs = settings.get("policy_kwargs") or {}
-    if not isinstance(policy_kwargs, dict):
-        raise UsageError(f"{', '.join(options)}: policy_kwargs is {policy_kwargs!r}, no mapping that could have them, too.")
-    others = {name: value for name, value in settings.items() if name not in names}
-    return {**others, "policy_kwargs": {**policy_kwargs, **options}}

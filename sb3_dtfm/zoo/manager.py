@@ -21,7 +21,8 @@ from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.arguments import with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.distributed import is_first_process
-from sb3_dtfm.zoo.arguments import UsageError, with_policy_options
+from sb3_dtfm.zoo.arguments import UsageError
+from sb3_dtfm.zoo.registration import with_policy_options
 from sb3_dtfm.zoo.resuming import CHECKPOINT, KeepCheckpoint, ReplaceEvaluations, Start, StopSignals, go_on
 
 # Keys of its YAML files that no algorithm sees.

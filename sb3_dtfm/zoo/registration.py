@@ -76,15 +76,31 @@ def convert_params(algo: str, sampled_params: dict[str, Any]) -> dict[str, Any]:
     RL-Zoo lets a trial's `policy_kwargs` replace the YAML's as a whole, so the search covers all that the packaged settings
     choose there.
 
-    :param algo: a key of `ALGORITHMS`
+    :param algo: unused, as options of the policy have the same names for all
     :param sampled_params: as Optuna stores them: flat, powers of two by their exponent
     """
     params = {
         name.removesuffix("_pow"): 2**value if name.endswith("_pow") else value for name, value in sampled_params.items()
     }
-    in_policy = policy_of(algo).parameter_names()
-    policy_kwargs = {name: params.pop(name) for name in list(params) if name in in_policy}
-    return {**params, "policy_kwargs": policy_kwargs}
+    return with_policy_options({"policy_kwargs": {}, **params})
+
+
+def with_policy_options(settings: dict[str, Any]) -> dict[str, Any]:
+    """
+    Settings in which options of a policy, as `-params critic_steps:10` gives them, are entries of the `policy_kwargs`.
+
+    :param settings: arguments of an algorithm, and what RL-Zoo knows beside them
+    :raises ValueError: the `policy_kwargs` are no mapping
+    """
+    names = set.union(*(policy_of(algo).parameter_names() for algo in ALGORITHMS))
+    options = {name: value for name, value in settings.items() if name in names}
+    if not options:
+        return settings
+    policy_kwargs = settings.get("policy_kwargs") or {}
+    if not isinstance(policy_kwargs, dict):
+        raise ValueError(f"{', '.join(options)}: policy_kwargs is {policy_kwargs!r}, no mapping that could have them, too.")
+    others = {name: value for name, value in settings.items() if name not in names}
+    return {**others, "policy_kwargs": {**policy_kwargs, **options}}
 
 
 def sample_params(

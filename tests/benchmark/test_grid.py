@@ -216,9 +216,11 @@ def test_the_packaged_profiles_differ_in_the_head_only(profile, env_id):
     assert (dt["dataset_fraction"], dt["dataset_seed"]) == (0.5, 0)
 
 
-def test_policy_kwargs_of_params_are_merged_and_heads_left_to_their_algorithm():
+@pytest.mark.parametrize("nested", [True, False])
+def test_policy_kwargs_of_params_are_merged_and_heads_left_to_their_algorithm(nested):
+    """Also where they stand beside the others, by their own names."""
     kwargs = {"n_solver_steps": 3, "dropout": 0.0, "regression_coef": 0.1}
-    changes = {"policy_kwargs": kwargs, "ema_decay": 0.9}
+    changes = {**({"policy_kwargs": kwargs} if nested else kwargs), "ema_decay": 0.9}
     dt, dtfm = (task_settings("small", algo, Task(TASK), 1.0, 7, changes) for algo in ("dt", "dtfm"))
     assert (dtfm["policy_kwargs"]["n_solver_steps"], dtfm["policy_kwargs"]["regression_coef"]) == (3, 0.1)
     assert dtfm["policy_kwargs"]["embed_dim"] == 128

@@ -204,6 +204,7 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
         f"--model {run} --algo dtfm -i alone.zip": "-i alone.zip: --model names what goes on",
         f"--model {run} --algo dtfm -params verbose:0": "verbose: no hyperparameter of finetune --algo dtfm.",
         f"--model {run} --algo dtfm -params policy_kwargs:dict(n_candidates=4)": "policy_kwargs: are those of the model",
+        f"--model {run} --algo dtfm -params n_candidates:4": "policy_kwargs: are those of the model",
         "--resume logs/dtfm/HalfCheetah-v5_1 --seed 3": "takes no other arguments",
         f"--model {run} -params {wrong}": "expected sb3_dtfm.finetuning.NoiseActionVecEnv alone.",
         f"--model {run} -params use_sde:True": "its exploration depends on the state (use_sde)",

@@ -7,8 +7,8 @@ from rl_zoo3.utils import StoreDict
 
 from sb3_dtfm import DTFM
 from sb3_dtfm.cli.main import main
-from sb3_dtfm.zoo.arguments import UsageError, enjoy_arguments, train_arguments, with_policy_options
-from sb3_dtfm.zoo.registration import packaged_config
+from sb3_dtfm.zoo.arguments import UsageError, enjoy_arguments, train_arguments
+from sb3_dtfm.zoo.registration import packaged_config, with_policy_options
 from tests.recorded import DATASET_ID, tiny_training
 
 ENV = ["--env", "Ant-v5"]
@@ -99,7 +99,7 @@ def test_options_of_the_policy_stand_among_the_others():
     assert with_policy_options({"critic_steps": 4}) == {"policy_kwargs": {"critic_steps": 4}}
     for alone in ({"n_timesteps": 3}, nested):
         assert with_policy_options(alone) == alone
-    with pytest.raises(UsageError, match="critic_steps: policy_kwargs is 'dict\\(\\)', no mapping"):
+    with pytest.raises(ValueError, match="critic_steps: policy_kwargs is 'dict\\(\\)', no mapping"):
         with_policy_options({"critic_steps": 4, "policy_kwargs": "dict()"})
 
 
