@@ -36,10 +36,12 @@ class Asked(NamedTuple):
 
     :param target: in environment reward units
     :param returns: (n,) what the episodes reached
+    :param successes: (n,) whether they solved the task; None where it reports none
     """
 
     target: float
     returns: list[float]
+    successes: list[bool] | None = None
 
     @property
     def interval(self) -> Interval:
@@ -174,7 +176,7 @@ def sweep(
             progress.update(before + n_done - progress.n)
 
         episodes = evaluate(model, vec_env, range(first, first + options.episodes), count)
-        reached.append(Asked(target, episodes.returns))
+        reached.append(Asked(target, episodes.returns, episodes.successes))
     vec_env.close()
     return reached
 
@@ -201,17 +203,19 @@ def first_state(options: argparse.Namespace) -> int:
 def table(curves: dict[str, list[Asked]]) -> list[str]:
     """
     :param curves: what each model reached, by its name
-    :return: lines of Markdown: mean return and its 95 % interval
+    :return: lines of Markdown: mean return and its 95 % interval, and how many episodes solved the task if it reports that
     """
     lines = [f"| asked | {' | '.join(curves)} |", f"| --- |{' --- |' * len(curves)}"]
     for row in zip(*curves.values(), strict=True):
-        lines.append(f"| {row[0].target:,.6g} | {' | '.join(_interval(asked.interval) for asked in row)} |")
+        lines.append(f"| {row[0].target:,.6g} | {' | '.join(map(_summary, row))} |")
     return lines
 
 
-def _interval(interval: Interval) -> str:
-    limits = "" if np.isnan(interval.low) else f" [{interval.low:,.6g}, {interval.high:,.6g}]"
-    return f"{interval.estimate:,.6g}{limits}"
+def _summary(asked: Asked) -> str:
+    estimate, low, high = asked.interval
+    limits = "" if np.isnan(low) else f" [{low:,.6g}, {high:,.6g}]"
+    solved = "" if asked.successes is None else f", {sum(asked.successes)} of {len(asked.successes)} solved"
+    return f"{estimate:,.6g}{limits}{solved}"
 
 
 def draw(curves: dict[str, list[Asked]], recorded: np.ndarray, output: Path, title: str) -> Path:

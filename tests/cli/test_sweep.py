@@ -94,9 +94,9 @@ def test_the_table_and_the_picture_say_what_was_reached(tmp_path, monkeypatch):
     )
     curves = {
         "DT": [Asked(1.0, [1.0, 3.0]), Asked(5.0, [4.0, 4.0])],
-        "DTFM": [Asked(1.0, [1.0, 1.0]), Asked(5.0, [5.0, 5.0])],
+        "DTFM": [Asked(1.0, [1.0, 1.0]), Asked(5.0, [5.0, 5.0], [True, False])],
     }
-    assert table(curves)[2:] == ["| 1 | 2 [-10.7062, 14.7062] | 1 |", "| 5 | 4 | 5 |"]
+    assert table(curves)[2:] == ["| 1 | 2 [-10.7062, 14.7062] | 1 |", "| 5 | 4 | 5, 1 of 2 solved |"]
     draw(curves, np.array([0.0, 1.0, 5.0]), tmp_path / "sweep.png", "HalfCheetah-v5")
     asked, *models = drawn[0].axes[0].lines
     assert asked.get_ydata().tolist() == [1, 5]
