@@ -126,7 +126,7 @@ def _sample_trunk(trial: optuna.Trial) -> dict[str, Any]:
         "batch_size_pow": trial.suggest_int("batch_size_pow", 5, 8),
         "weight_decay": trial.suggest_float("weight_decay", 1e-5, 1e-1, log=True),
         "ema_decay": trial.suggest_categorical("ema_decay", [0.0, 0.99, 0.999]),
-        "context_length": trial.suggest_categorical("context_length", [5, 10, 20, 50]),
+        "context_length": trial.suggest_categorical("context_length", [1, 5, 10, 20, 50]),
         "embed_dim_pow": trial.suggest_int("embed_dim_pow", 6, 8),
         "n_layers": trial.suggest_int("n_layers", 2, 10),
         "n_heads_pow": trial.suggest_int("n_heads_pow", 0, 2),

@@ -12,10 +12,6 @@ STUDIES = ("time-steps", "windows/*_uniform-windows.jsonl", "paused", "mixed", "
 REPORTS = {"docs": ("grid/*_small.jsonl",), "docs/studies": STUDIES}
 
 
-def tables(text: str) -> list[str]:
-    return [block for block in text.split("\n\n") if block.startswith("| ")]
-
-
 @pytest.mark.parametrize("docs", REPORTS)
 def test_a_report_shows_the_committed_rows(docs, tmp_path):
     results = [str(path) for pattern in REPORTS[docs] for path in sorted((ROOT / "results").glob(pattern))]
@@ -23,7 +19,3 @@ def test_a_report_shows_the_committed_rows(docs, tmp_path):
     assert (ROOT / docs / "report.md").read_text() == (tmp_path / "report.md").read_text()
     for figure in tmp_path.glob("*.png"):
         assert (ROOT / docs / figure.name).is_file()
-
-
-def test_the_readme_shows_the_table_of_the_report():
-    assert tables((ROOT / "docs" / "report.md").read_text())[0] in tables((ROOT / "README.md").read_text())
