@@ -22,6 +22,12 @@ def test_rows_lie_in_the_folder_of_a_study():
     assert all(list((ROOT / "results" / study).glob("*.jsonl")) for study in STUDIES)
 
 
+def test_rows_name_no_folder_of_the_machine_that_made_them():
+    rows = [*(ROOT / "results").rglob("*.jsonl"), *(ROOT / "results").rglob("*.json")]
+    assert rows
+    assert [str(path) for path in rows if '"/' in path.read_text()] == []
+
+
 @pytest.mark.parametrize("study", STUDIES)
 def test_a_study_shows_its_rows_and_the_commits_that_made_them(study):
     folder = ROOT / "results" / study
