@@ -82,7 +82,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         observation, so that asking for the best does not ask for luck (Paster et al., 2022); None takes what was recorded
     :param dataset_kwargs: further arguments of :func:`~sb3_dtfm.data.load_dataset`: `{"cache_dir": folder}` for datasets
         larger than memory, `{"env_id": id}` for data that were recorded under another environment's name, and the
-        reader's own, for example `{"filter_key": "train"}` for robomimic
+        reader's own, for example `{"filter_key": "train"}` for robomimic. `max_episode_steps` is the environment's unless
+        it is given: what episodes hold beyond it is left out, since no episode of the environment gets there; None keeps it
     :param max_grad_norm: clip the gradient's norm to this; None and 0 do not clip
     :param warmup_steps: gradient steps over which the learning rate rises linearly from zero; 0 for none
     :param learning_rate_schedule: factor on the learning rate: "constant", or "linear" or "cosine" down to zero
@@ -211,9 +212,9 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
                 f"{name} has no dataset to learn from: give one to the constructor, or to a loaded model by "
                 f"{name}.load(path, dataset=...) or model.set_dataset(...)."
             )
+        of_the_environment = {"action_space": getattr(self, "action_space", None), "max_episode_steps": self._time_limit()}
         with first_of_each_machine_first():
-            action_space = getattr(self, "action_space", None)
-            buffer = load_dataset(self.dataset, **{"action_space": action_space, **(self.dataset_kwargs or {})})
+            buffer = load_dataset(self.dataset, **{**of_the_environment, **(self.dataset_kwargs or {})})
         observation_space = return_to_go_space(buffer.observation_space)
         if getattr(self, "observation_space", None) is None:
             self.observation_space, self.action_space, self.n_envs = observation_space, buffer.action_space, 1
@@ -252,6 +253,11 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         (spec,) = env.get_attr("spec", indices=0)
         if spec is not None:
             buffer.check_task(spec.id)
+
+    def _time_limit(self) -> int | None:
+        """Steps after which Gymnasium ends an episode of the environment; None where it does not, or there is none."""
+        (spec,) = [None] if self.env is None else self.env.get_attr("spec", indices=0)
+        return None if spec is None else spec.max_episode_steps
 
     def _setup_model(self) -> None:
         self._check_arguments(learning_rate=NOT_NEGATIVE)

@@ -14,10 +14,10 @@ from gymnasium.envs.registration import parse_env_id
 from sb3_dtfm.actions import ActionSpace, bounds_of, from_vectors
 from sb3_dtfm.data.collecting import collect
 from sb3_dtfm.data.drawing import FlatSteps
-from sb3_dtfm.data.episodes import EpisodeTable, Statistics
+from sb3_dtfm.data.episodes import EpisodeTable, Statistics, moments
 from sb3_dtfm.data.expected import Steps, expected_returns_to_go
 from sb3_dtfm.data.storage import STEP_ARRAYS, FileStorage, MappedSteps, MemoryStorage
-from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory
+from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, returns_to_go
 from sb3_dtfm.files import replacing
 
 
@@ -173,6 +173,41 @@ class TrajectoryBuffer(FlatSteps):
         changed = copy.copy(self)
         changed.returns_to_go = self.returns_to_go.clone()
         changed.returns_to_go[rows] = expected_returns_to_go(steps, n_steps, self.statistics(), seed)
+        return changed
+
+    def within(self, max_episode_steps: int) -> "TrajectoryBuffer":
+        """
+        A buffer of what an environment with such a time limit would have shown: of longer episodes the first steps, which
+        count as truncated, and returns of these. Whether one has succeeded by then, the data do not tell.
+
+        :param max_episode_steps: steps of an episode, at least 1
+        :return: on the same flat tensors, but for the returns-to-go; the buffer itself where no episode is longer
+        :raises ValueError: `max_episode_steps` below 1
+        """
+        if max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps must be at least 1, got {max_episode_steps}.")
+        longer = np.flatnonzero(self.episode_lengths > max_episode_steps)
+        if not len(longer):
+            return self
+        warnings.warn(
+            f"{self.source}: {len(longer)} of {self.n_episodes} episodes have more than {max_episode_steps} steps, up to "
+            f"{self.episode_lengths.max()}. What came later is left out, rewards too. An environment with a larger "
+            "max_episode_steps shows it; dataset_kwargs={'max_episode_steps': None} learns from it all the same.",
+            stacklevel=2,
+        )
+        table = EpisodeTable(*(column.copy() for column in self.episodes))
+        table.lengths[longer], table.terminated[longer], table.truncated[longer] = max_episode_steps, False, True
+        table.successes[longer] = np.nan
+        changed = copy.copy(self)
+        changed.returns_to_go = self.returns_to_go.clone()
+        for episode in longer:
+            steps = slice(table.starts[episode], table.starts[episode] + max_episode_steps)
+            to_go = returns_to_go(self.rewards[steps].cpu().numpy())
+            changed.returns_to_go[steps] = th.from_numpy(to_go).to(changed.returns_to_go)
+            table.returns[episode], table.return_scales[episode] = to_go[0], np.abs(to_go).max()
+            found = moments(self.observations[steps].cpu().numpy())
+            table.observation_means[episode], table.observation_squares[episode] = found
+        changed._set_episodes(table)
         return changed
 
     def largest_discounted_return(self, gamma: float) -> float:

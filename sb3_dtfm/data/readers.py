@@ -27,7 +27,7 @@ Dataset: TypeAlias = (
     str | os.PathLike[str] | MinariDataset | Mapping[str, Any] | Sequence[Any] | ReplayBuffer | TrajectoryBuffer
 )
 # What load_dataset itself does with a dataset of any kind.
-COMMON_OPTIONS = ("env_id", "action_space", "min_return", "best_share", "success_only")
+COMMON_OPTIONS = ("env_id", "action_space", "max_episode_steps", "min_return", "best_share", "success_only")
 
 
 class Reader(NamedTuple):
@@ -96,6 +96,7 @@ def load_dataset(
     cache_dir: str | os.PathLike[str] | None = None,
     env_id: str | None = None,
     action_space: ActionSpace | None = None,
+    max_episode_steps: int | None = None,
     min_return: float | None = None,
     best_share: float | None = None,
     success_only: bool = False,
@@ -107,11 +108,13 @@ def load_dataset(
     :param dataset: a Minari id (`namespace/name-vN`), an opened Minari dataset, the path of a robomimic hdf5 file; flat
         arrays, as the path of an `.npz` or of D4RL's hdf5, or a dictionary, see :func:`load_flat`; the folder of a LeRobot
         dataset, see :func:`load_lerobot`; a list of episodes, see :func:`load_episodes`; an SB3 replay buffer, see
-        :func:`load_replay_buffer`; a list of several datasets, see :func:`load_several`; a buffer, which stays as it is
+        :func:`load_replay_buffer`; a list of several datasets, see :func:`load_several`; a buffer
     :param cache_dir: learn from memory-mapped files in this folder, for datasets larger than memory; they are written at
         the first call and whenever the dataset has changed. None reads everything into memory
     :param env_id: Gymnasium id of the environment that the episodes count as coming from, whatever the dataset says
     :param action_space: the environment's, for data that do not tell of a range of actions
+    :param max_episode_steps: leave out what episodes hold beyond so many steps, with a warning; see
+        :meth:`TrajectoryBuffer.within`. None keeps all
     :param min_return: leave out episodes of a smaller return, environment reward units
     :param best_share: keep this share of the episodes, those of the largest returns
     :param success_only: keep the successes alone, by what the data say of each episode's last step; see
@@ -144,6 +147,8 @@ def load_dataset(
     if env_id is not None:
         buffer = copy.copy(buffer)
         buffer.env_id = env_id
+    if max_episode_steps is not None:
+        buffer = buffer.within(max_episode_steps)
     return buffer.best(min_return, best_share, success_only)
 
 
