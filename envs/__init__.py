@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         check_vec_env,
         flatten_observation_space,
         return_to_go_space,
+        time_limit,
     )
 
 register_robosuite_envs()
@@ -30,6 +31,7 @@ __all__ = [
     "register_gymnasium_robotics",
     "register_robosuite_envs",
     "return_to_go_space",
+    "time_limit",
 ]
 
 

@@ -189,3 +189,9 @@ def check_vec_env(env: VecEnv) -> None:
             "The environment must be wrapped in sb3_dtfm.envs.ReturnToGoWrapper(env, target_return=...), inside any "
             f"vectorised environment; its observation space is {env.observation_space}."
         )
+
+
+def time_limit(env: VecEnv) -> int | None:
+    """Steps after which Gymnasium ends an episode; None where it does not."""
+    (spec,) = env.get_attr("spec", indices=0)
+    return None if spec is None else spec.max_episode_steps

@@ -32,7 +32,7 @@ from sb3_dtfm.arguments import (
 )
 from sb3_dtfm.data import Dataset, DatasetError, ScoreReference, TrajectoryBuffer, check_action_space, load_dataset
 from sb3_dtfm.distributed import check_batch_size, first_of_each_machine_first, is_first_process
-from sb3_dtfm.envs import check_vec_env, return_to_go_space
+from sb3_dtfm.envs import check_vec_env, return_to_go_space, time_limit
 from sb3_dtfm.files import ModelFile, file_name, holds_pickles, read_model, write_model, write_onnx
 from sb3_dtfm.optimization import LEARNING_RATE_SCHEDULES, PRECISIONS, RunningMeans
 from sb3_dtfm.policies import SequencePolicy
@@ -212,7 +212,9 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
                 f"{name} has no dataset to learn from: give one to the constructor, or to a loaded model by "
                 f"{name}.load(path, dataset=...) or model.set_dataset(...)."
             )
-        of_the_environment = {"action_space": getattr(self, "action_space", None), "max_episode_steps": self._time_limit()}
+        of_the_environment: dict[str, Any] = {"action_space": getattr(self, "action_space", None)}
+        if self.env is not None:
+            of_the_environment["max_episode_steps"] = time_limit(self.env)
         with first_of_each_machine_first():
             buffer = load_dataset(self.dataset, **{**of_the_environment, **(self.dataset_kwargs or {})})
         observation_space = return_to_go_space(buffer.observation_space)
@@ -253,11 +255,6 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         (spec,) = env.get_attr("spec", indices=0)
         if spec is not None:
             buffer.check_task(spec.id)
-
-    def _time_limit(self) -> int | None:
-        """Steps after which Gymnasium ends an episode of the environment; None where it does not, or there is none."""
-        (spec,) = [None] if self.env is None else self.env.get_attr("spec", indices=0)
-        return None if spec is None else spec.max_episode_steps
 
     def _setup_model(self) -> None:
         self._check_arguments(learning_rate=NOT_NEGATIVE)

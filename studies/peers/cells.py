@@ -16,6 +16,7 @@ from sb3_dtfm.benchmark.evaluation import FINAL_STATES, evaluate, make_seeded_en
 from sb3_dtfm.benchmark.rows import Cell, Row, read_rows
 from sb3_dtfm.benchmark.settings import Task, read_yaml, task_settings
 from sb3_dtfm.data import TrajectoryBuffer, load_dataset
+from sb3_dtfm.envs import time_limit
 from sb3_dtfm.zoo.arguments import UsageError
 
 HERE = Path(__file__).parent
@@ -139,15 +140,17 @@ def peer_cell(data: Data, peer: Peer, seed: int, label: str = "") -> Cell:
     return Cell(data.task, data.fraction, peer.name, seed, PROFILE, "-".join(filter(None, (data.name, label))))
 
 
-def export(data: Data, peer: Peer, path: Path) -> TrajectoryBuffer:
+def export(data: Data, peer: Peer, path: Path, max_episode_steps: int | None) -> TrajectoryBuffer:
     """
     Write the episodes that a peer is to learn from, as flat arrays.
 
     :param path: of the `.npz` file
+    :param max_episode_steps: the environment's, up to which ours learn from them
     :return: the same episodes
     """
     settings = data.settings()
-    buffer = load_dataset(settings["dataset"], **(settings.get("dataset_kwargs") or {}))
+    options = {"max_episode_steps": max_episode_steps, **(settings.get("dataset_kwargs") or {})}
+    buffer = load_dataset(settings["dataset"], **options)
     buffer = buffer.random_fraction(settings["dataset_fraction"], settings["dataset_seed"])
     if peer.best_share is not None:
         buffer = buffer.best(best_share=peer.best_share)
@@ -214,7 +217,7 @@ def run_peer(
         tempfile.TemporaryDirectory() as folder,
     ):
         path = Path(folder) / "episodes.npz"
-        export(data, peer, path)
+        export(data, peer, path, time_limit(vec_env))
         training = process.train(
             path, peer.settings_for(data), seed, *budget, lambda done, n_steps: say(done, n_steps, "training")
         )

@@ -80,11 +80,12 @@ def test_a_message_arrives_as_it_was_sent():
         receive(stream)
 
 
-@pytest.mark.parametrize(("fraction", "best_share"), [(1.0, None), (0.6, None), (1.0, 0.4)])
-def test_a_peer_is_given_the_steps_that_ours_learn_from(datasets, buffer, tmp_path, fraction, best_share):
+@pytest.mark.filterwarnings("ignore:.*max_episode_steps")
+@pytest.mark.parametrize(("fraction", "best_share", "limit"), [(1.0, None, None), (0.6, None, 8), (1.0, 0.4, 9)])
+def test_a_peer_is_given_the_steps_that_ours_learn_from(datasets, buffer, tmp_path, fraction, best_share, limit):
     data = cells.read_entries(datasets, cells.Data)["pendulum"]._replace(fraction=fraction)
-    cells.export(data, cells.Peer("any", "d3rlpy", 1, {}, best_share=best_share), tmp_path / "out.npz")
-    expected = buffer.random_fraction(fraction, seed=0)
+    cells.export(data, cells.Peer("any", "d3rlpy", 1, {}, best_share=best_share), tmp_path / "out.npz", limit)
+    expected = load_dataset(buffer, max_episode_steps=limit).random_fraction(fraction, seed=0)
     expected = expected if best_share is None else expected.best(best_share=best_share)
     given = read_dataset(tmp_path / "out.npz")
     assert [len(episode.actions) for episode in given.episodes] == expected.episode_lengths.tolist()
