@@ -47,6 +47,7 @@ class ActingPolicy(BasePolicy):
     chunk_size: int
     n_action_steps: int
     n_candidates: int
+    candidate_noise: float
     n_valued: int
     temperature: float
     kv_cache: bool
@@ -330,6 +331,7 @@ class ActingPolicy(BasePolicy):
         assert self.critic is not None
         n, turns = self.n_candidates, np.arange(self.n_candidates)
         noise = self._acting_noise((rows[:, None] + CANDIDATE_STRIDE * turns).ravel(), deterministic).to(hidden.device)
+        noise = self.candidate_noise * noise
         candidates = self._decode(hidden.repeat_interleave(n, dim=0), noise).view(len(hidden), n, -1)
         chance = self._acting_noise((rows[:, None] + CHOICE_START + CHOICE_STRIDE * turns).ravel(), deterministic)
         uniform = th.special.ndtr(chance[:, 0]).clamp(1e-6, 1 - 1e-6).view(len(hidden), n).to(hidden.device)

@@ -16,6 +16,7 @@ from sb3_dtfm.arguments import (
     BOOLEAN,
     COUNT,
     NOT_NEGATIVE,
+    POSITIVE,
     PROBABILITY_BELOW_1,
     Choice,
     Number,
@@ -95,6 +96,8 @@ class SequencePolicy(ActingPolicy):
     :param gamma: discount of a step for the critic
     :param expectile: of the critic
     :param n_candidates: actions, or chunks, that are drawn each time, of which the critic has one taken; 1 asks no critic
+    :param candidate_noise: standard deviation of the noise that they start from; above 1, which the flow has learned, they
+        differ more, and the critic has more to choose among
     :param temperature: how much chance that choice leaves, in units of how far actions' values spread in the data; 0, the
         default, takes the most valuable one
     :param ema: keep an exponential moving average of the weights and act with it
@@ -131,6 +134,7 @@ class SequencePolicy(ActingPolicy):
         gamma: float = 0.99,
         expectile: float = 0.7,
         n_candidates: int = 1,
+        candidate_noise: float = 1.0,
         temperature: float = 0.0,
         ema: bool = False,
         kv_cache: bool = False,
@@ -154,7 +158,8 @@ class SequencePolicy(ActingPolicy):
             )
         arguments.update(check_arguments(arguments, self._acting_rules()))
         self.n_action_steps = arguments["n_action_steps"]
-        self.n_candidates, self.temperature = arguments["n_candidates"], arguments["temperature"]
+        self.n_candidates, self.candidate_noise = arguments["n_candidates"], arguments["candidate_noise"]
+        self.temperature = arguments["temperature"]
         self._constructor_arguments = {**arguments, **self.head_class.options(), **head_options}
         self.seed = seed
         self.observation_dim = int(observation_space["observation"].shape[0])  # type: ignore[index]
@@ -323,6 +328,7 @@ class SequencePolicy(ActingPolicy):
             "kv_cache": BOOLEAN,
             "n_action_steps": Number(low=1, high=self.chunk_size, whole=True),
             "n_candidates": Number(low=1, high=NOISE_ROWS, whole=True),
+            "candidate_noise": POSITIVE,
             "temperature": NOT_NEGATIVE,
         }
 

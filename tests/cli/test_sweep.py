@@ -53,7 +53,7 @@ def test_two_models_are_asked_for_the_range_of_their_data(workplace, capsys):
     assert main(["sweep", *slower, "speed:7"]) == 2
     errors = capsys.readouterr().err
     assert "--acting: n_solver_steps" in errors
-    accepted = "kv_cache, n_action_steps, n_candidates, temperature, solver, n_solver_steps"
+    accepted = "kv_cache, n_action_steps, n_candidates, candidate_noise, temperature, solver, n_solver_steps"
     assert f"--acting: speed: no way of acting; accepted are {accepted}." in errors
 
 

@@ -8,6 +8,7 @@ from gymnasium import spaces
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.files import ModelFileError
+from sb3_dtfm.policies.acting import CANDIDATE_STRIDE
 from sb3_dtfm.policies.critic import Critic
 from sb3_dtfm.windows import Context
 from tests.algorithms.small import make_model, record_curves
@@ -178,6 +179,22 @@ def test_of_the_draws_the_most_valuable_one_is_taken(cheetah_buffer, solver):
     assert (values[8] >= values[1] - 1e-6).all()
     assert (values[32] >= values[8] - 1e-6).all()
     assert (values[32] > values[1] + 1e-4).mean() > 0.5
+
+
+@pytest.mark.parametrize("candidate_noise", [1.0, 1.5])
+def test_candidates_start_from_noise_as_wide_as_is_said(cheetah_buffer, candidate_noise):
+    policy = make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=1)).policy
+    policy.set_training_mode(False)
+    policy.set_acting(n_candidates=4, candidate_noise=candidate_noise)
+    hidden = th.randn(5, policy.network.trunk.embed_dim, generator=th.Generator().manual_seed(0))
+    rows = np.arange(5)
+    with th.no_grad():
+        candidates, _ = policy._draw_candidates(hidden, cheetah_buffer.observations[:5], rows, deterministic=True)
+        for turn in range(4):
+            noise = policy.noise_table[th.from_numpy(rows + CANDIDATE_STRIDE * turn) % len(policy.noise_table)]
+            th.testing.assert_close(candidates[:, turn], policy._decode(hidden, candidate_noise * noise))
+    with pytest.raises(ValueError, match="candidate_noise"):
+        policy.set_acting(candidate_noise=0.0)
 
 
 def test_what_chooses_by_value_is_not_exported(cheetah_buffer, tmp_path):
