@@ -321,6 +321,7 @@ IN_README = {
     "walker2d-mediocre-noisy": "Walker2d, three mediocre agents, noisy",
     "halfcheetah-mediocre-noisy": "HalfCheetah, three mediocre agents, noisy",
     "can-dropped": "Can, every second one dropped",
+    "door-human": "Adroit's door, by 25 people",
     "door-mixed": "Adroit's door, by 25 people and ten times by a noisy agent",
 }
 README_COLUMNS = ("dtfm", "dt", "bc", "bc-best", "d3rlpy-dt", "iql", "td3-bc", "rebrac", "bc-rnn-gmm")
