@@ -64,7 +64,8 @@ def test_an_end_behind_the_limit_is_not_learned_as_one():
 
 def test_nothing_changes_where_no_episode_is_longer():
     buffer = make_buffer(LENGTHS)
-    with warnings.catch_warnings(action="error"):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
         assert buffer.within(12) is buffer
     with pytest.raises(ValueError, match="at least 1"):
         buffer.within(0)

@@ -1,0 +1,81 @@
+"""
+What the critic's choice is worth at Can by how candidates are drawn, and by whom (docs/studies/finetuning.md).
+
+    python studies/candidates.py --n 16 --noise 1.5 logs/dtfm/robosuite-Can-v0_7/robosuite-Can-v0.zip ...
+    python studies/candidates.py --together models --n 8 ONE.zip TWO.zip THREE.zip
+
+Plays final episodes of `sb3-dtfm benchmark`, from the thousandth on with `--first 1000`. `--together models` takes the most
+valuable of what all models draw, by the mean of their critics, `critics` of what the first one draws.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch as th
+from several_models import N_ENVS, SETTINGS
+
+from sb3_dtfm import DTFM
+from sb3_dtfm.benchmark.evaluation import FINAL_STATES, evaluate, make_seeded_envs
+from sb3_dtfm.policies import SequencePolicy
+from sb3_dtfm.windows import Context, Windows
+
+
+def choose_together(policies: list[SequencePolicy], draws_of_all: bool) -> None:
+    """
+    Let the first policy carry out what the mean of all critics finds most valuable.
+
+    :param policies: with critics, of the same sizes, without `kv_cache`
+    :param draws_of_all: whose candidates; the first one's alone otherwise
+    """
+    first = policies[0]
+    for policy in policies:
+        policy.set_training_mode(False)
+
+    def choose(context: Context, due: np.ndarray, deterministic: bool) -> tuple[np.ndarray, np.ndarray]:
+        keys_values = np.zeros((len(due), 0), np.float32)
+        if not due.any():
+            return np.zeros((0, first.chunk_size, first.action_dim), np.float32), keys_values
+        windows = Windows(*(th.from_numpy(each[due]) for each in context.windows))
+        rows = context.timesteps[due, -1] + context.episode_keys[due]
+        seen = windows.observations[:, -1]
+        drawn = []
+        for each in policies if draws_of_all else policies[:1]:
+            hidden = each.hidden_states(each.acting_network, windows, last_only=True).squeeze(1)
+            drawn.append(each._draw_candidates(hidden, seen, rows, deterministic)[0])
+        candidates = th.cat(drawn, dim=1)
+        values = th.zeros(candidates.shape[:2])
+        for each in policies:
+            assert each.critic is not None
+            states = each.normalization.scale_observation(seen).unsqueeze(1).expand(-1, candidates.shape[1], -1)
+            values += each.critic(states, candidates[..., : each.n_valued * each.action_dim])
+        return first._to_chunks(candidates[th.arange(len(rows)), values.argmax(dim=1)]), keys_values
+
+    first._choose = choose  # type: ignore[method-assign]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("models", nargs="+", type=Path)
+    parser.add_argument("--n", type=int, default=8, help="candidates; 8 by default")
+    parser.add_argument("--noise", type=float, default=1.0, help="candidate_noise; 1 by default")
+    parser.add_argument("--together", choices=("models", "critics"))
+    parser.add_argument("--first", type=int, default=0, help="final episode to begin with")
+    parser.add_argument("--episodes", type=int, default=100)
+    options = parser.parse_args()
+    th.set_num_threads(1)
+    models = [DTFM.load(path, device="cpu") for path in options.models]
+    for model in models:
+        model.policy.set_acting(n_candidates=options.n, candidate_noise=options.noise)
+    if options.together:
+        choose_together([model.policy for model in models], options.together == "models")
+    envs = make_seeded_envs("robosuite/Can-v0", SETTINGS, N_ENVS)
+    states = range(FINAL_STATES + options.first, FINAL_STATES + options.first + options.episodes)
+    for path, model in list(zip(options.models, models, strict=True))[: 1 if options.together else None]:
+        found = evaluate(model, envs, states, lambda n: None)
+        assert found.successes is not None
+        print(f"{path}: {np.sum(found.successes):.0f} of {options.episodes} solved", flush=True)
+
+
+if __name__ == "__main__":
+    main()
