@@ -83,7 +83,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
     :param dataset_kwargs: further arguments of :func:`~sb3_dtfm.data.load_dataset`: `{"cache_dir": folder}` for datasets
         larger than memory, `{"env_id": id}` for data that were recorded under another environment's name, and the
         reader's own, for example `{"filter_key": "train"}` for robomimic. `max_episode_steps` is the environment's unless
-        it is given: what episodes hold beyond it is left out, since no episode of the environment gets there; None keeps it
+        it is given, and stays the model's when it is saved: what episodes hold beyond it is left out, since no episode of
+        the environment gets there; None keeps it
     :param max_grad_norm: clip the gradient's norm to this; None and 0 do not clip
     :param warmup_steps: gradient steps over which the learning rate rises linearly from zero; 0 for none
     :param learning_rate_schedule: factor on the learning rate: "constant", or "linear" or "cosine" down to zero
@@ -165,6 +166,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         self.precision = precision
         self.compile = compile
         self.max_timestep = 1000
+        self.time_limit: int | None = None  # of the newest environment that it learned for
         self.score_reference: ScoreReference | None = None
         self.buffer: TrajectoryBuffer | None = None
         self._means = RunningMeans()
@@ -212,11 +214,11 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
                 f"{name} has no dataset to learn from: give one to the constructor, or to a loaded model by "
                 f"{name}.load(path, dataset=...) or model.set_dataset(...)."
             )
-        of_the_environment: dict[str, Any] = {"action_space": getattr(self, "action_space", None)}
         if self.env is not None:
-            of_the_environment["max_episode_steps"] = time_limit(self.env)
+            self.time_limit = time_limit(self.env)
+        known = {"action_space": getattr(self, "action_space", None), "max_episode_steps": self.time_limit}
         with first_of_each_machine_first():
-            buffer = load_dataset(self.dataset, **{**of_the_environment, **(self.dataset_kwargs or {})})
+            buffer = load_dataset(self.dataset, **{**known, **(self.dataset_kwargs or {})})
         observation_space = return_to_go_space(buffer.observation_space)
         if getattr(self, "observation_space", None) is None:
             self.observation_space, self.action_space, self.n_envs = observation_space, buffer.action_space, 1

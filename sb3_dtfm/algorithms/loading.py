@@ -35,6 +35,7 @@ COUNTERS: dict[str, Rule] = {
     "_n_updates": WHOLE,
     "n_envs": COUNT,
     "max_timestep": COUNT,
+    "time_limit": COUNT._replace(optional=True),
     "verbose": WHOLE,
 }
 # Of the policy's tensors.

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
@@ -13,6 +14,7 @@ from sb3_dtfm.actions import ActionSpace
 from sb3_dtfm.cli.literals import key_value
 from sb3_dtfm.data import TrajectoryBuffer, load_dataset
 from sb3_dtfm.data.inspection import Inspection, Range, inspect_buffer
+from sb3_dtfm.envs import register_gymnasium_robotics
 
 BLUE, RED, GREY = "#1b6ca8", "#c0562b", "0.6"
 # Discrete actions that are counted in the table, the most frequent ones.
@@ -29,13 +31,29 @@ def main(argv: Sequence[str]) -> None:
     """
     options = _parser().parse_args(argv)
     dataset = options.dataset[0] if len(options.dataset) == 1 else options.dataset
-    buffer = load_dataset(dataset, **dict(options.dataset_kwargs))
+    buffer = load(dataset, dict(options.dataset_kwargs))
     found = inspect_buffer(buffer)
     print("\n".join(table(buffer, found)))
     for remark in found.remarks:
         print(f"- {remark}")
     print(f"\nTo begin with:\n  {command(options.dataset, options.dataset_kwargs, buffer, found)}")
     print(f"\nPicture: {draw(buffer, found, Path(options.output), ' + '.join(options.dataset))}")
+
+
+def load(dataset: str | list[str], options: dict[str, Any]) -> TrajectoryBuffer:
+    """
+    A dataset as its task would learn from it: up to the time limit, where the task is known here.
+
+    :param dataset: Minari id, file, or several of them
+    :param options: of its reader
+    """
+    buffer = load_dataset(dataset, **options)
+    register_gymnasium_robotics()
+    spec = gym.registry.get(buffer.env_id or "")
+    limit = None if spec is None else spec.max_episode_steps
+    if limit is None or "max_episode_steps" in options or buffer.episode_lengths.max() <= limit:
+        return buffer
+    return load_dataset(dataset, max_episode_steps=limit, **options)
 
 
 def _parser() -> argparse.ArgumentParser:

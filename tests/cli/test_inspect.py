@@ -3,6 +3,7 @@
 import shlex
 
 import numpy as np
+import pytest
 
 from sb3_dtfm.cli.main import main
 from sb3_dtfm.data import load_dataset
@@ -93,3 +94,15 @@ def test_options_of_the_reader_and_several_datasets(workplace, capsys):
     assert "dataset:['a.npz', 'b.npz']" in given
     assert main(["inspect", "none.npz"]) == 2
     assert "none.npz does not exist" in capsys.readouterr().err
+
+
+def test_what_lies_behind_the_task_s_time_limit_is_not_counted(workplace, capsys):
+    np.savez("long.npz", **arrays(n_episodes=5, n_steps=250), env_id="Pendulum-v1")  # ends after 200 steps
+    with pytest.warns(UserWarning, match="5 of 5 episodes have more than 200 steps"):
+        assert main(["inspect", "long.npz"]) == 0
+    text = capsys.readouterr().out
+    assert "| steps | 1,000; an episode has 200 to 200" in text
+    assert "best: 0, 0.32, 1.6, 2.88, 3.2 |" in text
+    assert "--target-return 3.2" in text
+    assert main(["inspect", "long.npz", "--dataset-kwargs", "max_episode_steps:None"]) == 0
+    assert "an episode has 250 to 250" in capsys.readouterr().out

@@ -99,6 +99,16 @@ def test_the_environment_s_time_limit_counts_unless_another_is_given(algorithm, 
     assert model.learn(2).buffer.episode_lengths.max() == longest
 
 
+@pytest.mark.filterwarnings("ignore:.*max_episode_steps")
+def test_a_loaded_model_knows_the_time_limit_that_it_learned_for(cheetah_buffer, tmp_path):
+    env = ReturnToGoWrapper(gym.make("HalfCheetah-v5", max_episode_steps=20), target_return=0.0)
+    make_model(DT, cheetah_buffer, env=env).save(tmp_path / "model.zip")
+    model = DT.load(tmp_path / "model.zip", dataset=cheetah_buffer).learn(1)
+    assert model.buffer.episode_lengths.tolist() == [20] * cheetah_buffer.n_episodes
+    model = DT.load(tmp_path / "model.zip", dataset=cheetah_buffer, dataset_kwargs={"max_episode_steps": None}).learn(1)
+    assert model.buffer.episode_lengths.max() == EPISODE_LENGTH
+
+
 def test_without_an_environment_nothing_is_left_out():
     model = make_model(DT, make_buffer(LENGTHS), env=None)
     assert model.max_timestep == 12
