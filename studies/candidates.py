@@ -1,5 +1,5 @@
 """
-What the critic's choice is worth at Can by how candidates are drawn, and by whom (docs/studies/finetuning.md).
+What the critic's choice is worth on an arm by how candidates are drawn, and by whom (docs/studies/finetuning.md).
 
     python studies/candidates.py --n 16 --noise 1.5 logs/dtfm/robosuite-Can-v0_7/robosuite-Can-v0.zip ...
     python studies/candidates.py --together models --n 8 ONE.zip TWO.zip THREE.zip
@@ -59,6 +59,7 @@ def main() -> None:
     parser.add_argument("models", nargs="+", type=Path)
     parser.add_argument("--n", type=int, default=8, help="candidates; 8 by default")
     parser.add_argument("--noise", type=float, default=1.0, help="candidate_noise; 1 by default")
+    parser.add_argument("--env", default="robosuite/Can-v0", help="robosuite/Can-v0 by default")
     parser.add_argument("--together", choices=("models", "critics"))
     parser.add_argument("--first", type=int, default=0, help="final episode to begin with")
     parser.add_argument("--episodes", type=int, default=100)
@@ -69,7 +70,7 @@ def main() -> None:
         model.policy.set_acting(n_candidates=options.n, candidate_noise=options.noise)
     if options.together:
         choose_together([model.policy for model in models], options.together == "models")
-    envs = make_seeded_envs("robosuite/Can-v0", SETTINGS, N_ENVS)
+    envs = make_seeded_envs(options.env, SETTINGS, N_ENVS)
     states = range(FINAL_STATES + options.first, FINAL_STATES + options.first + options.episodes)
     for path, model in list(zip(options.models, models, strict=True))[: 1 if options.together else None]:
         found = evaluate(model, envs, states, lambda n: None)
