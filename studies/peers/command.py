@@ -58,7 +58,7 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
     add("--algo", dest="algos", nargs="+", metavar="NAME", help="dt, dtfm, and peers of --settings; all by default")
     add("--seeds", type=int, nargs="+", default=[0, 1, 2], metavar="SEED", help="0 1 2 by default")
     add("--minutes", type=float, metavar="N", help="of a peer's training on one core; the dataset's by default")
-    add("--steps", type=int, metavar="N", help="gradient steps of a peer, instead of minutes")
+    add("--steps", type=int, metavar="N", help="gradient steps, instead of a peer's minutes or our settings'")
     add("--label", default="", help="added to the dataset's name in the rows, for what was changed")
     several: dict[str, Any] = {"nargs": "+", "action": "extend", "default": []}
     add(
@@ -150,7 +150,8 @@ def run_ours(data: Data, algos: Sequence[str], seed: int, options: argparse.Name
         command = ["--datasets", file.name, "--algo", *algos, "--fractions", str(data.fraction), "--seeds", str(seed)]
         command += ["--profile", data.profile, "--label", label, "--device", "cpu", "-o", options.results]
         command += ["-f", options.log_folder, "--final-episodes", str(options.final_episodes), "--eval-episodes", "10"]
-        command += ["--n-eval-envs", str(options.n_eval_envs), "-n", str(data.our_steps), "--eval-freq", str(data.our_steps)]
+        n_steps = str(options.steps or data.our_steps)
+        command += ["--n-eval-envs", str(options.n_eval_envs), "-n", n_steps, "--eval-freq", n_steps]
         command += ["--gym-packages", *data.gym_packages] if data.gym_packages else []
         params = {**data.params, **options.hyperparams}
         command += ["-params", *(f"{key}:{value!r}" for key, value in params.items())] if params else []

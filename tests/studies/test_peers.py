@@ -225,6 +225,13 @@ def test_a_search_changes_settings_and_names_its_rows(tmp_path, datasets, monkey
     assert PEERS["bc"].changed({"hidden": [8]}).settings["hidden"] == [512] * 3, "the other rows' settings stay"
 
 
+@pytest.mark.slow
+def test_ours_take_the_steps_that_are_asked_for(tmp_path, datasets):
+    command.main(command_line(tmp_path, datasets, "--algo", "dt", "--steps", "3"))
+    (file,) = (tmp_path / "rows").glob("*.jsonl")
+    assert [(row["algo"], row["step"]) for row in read_rows(file) if row.get("final")] == [("dt", 3)]
+
+
 class Counting:
     """Acts as the tiny worker does in a space of one action: by how long the episode has been."""
 
