@@ -191,7 +191,10 @@ def check_vec_env(env: VecEnv) -> None:
         )
 
 
-def time_limit(env: VecEnv) -> int | None:
-    """Steps after which Gymnasium ends an episode; None where it does not."""
+def time_limit(env: VecEnv, otherwise: int | None = None) -> int | None:
+    """
+    :param otherwise: where the environment has no `spec` to tell
+    :return: steps after which Gymnasium ends an episode; None where it does not
+    """
     (spec,) = env.get_attr("spec", indices=0)
-    return None if spec is None else spec.max_episode_steps
+    return otherwise if spec is None else spec.max_episode_steps

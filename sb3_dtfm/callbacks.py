@@ -87,6 +87,8 @@ class EvaluateAtStartAndEnd(BaseCallback):
     def _on_training_start(self) -> None:
         if self._evaluated_at != self.num_timesteps:
             self._evaluate(self.eval_callbacks)
+        else:  # and at the end, even if no step of an environment is left
+            self._evaluated_at = None
 
     def _on_step(self) -> bool:
         if any(evaluation.n_calls % evaluation.eval_freq == 0 for evaluation in self.eval_callbacks):

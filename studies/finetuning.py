@@ -64,12 +64,15 @@ def measure(run: Path, before: Path, like: Row, label: str, output: Path) -> Non
 
 def environment_steps(run: Path) -> np.ndarray:
     """When the episodes of a run ended, (E + 1, 2): seconds since its start, and the steps of all of them by then."""
-    lines = [line for path in run.glob("*.monitor.csv") for line in path.read_text().splitlines()[2:]]
-    ends = np.array(
-        sorted((float(seconds), float(length)) for _, length, seconds in (line.split(",")[:3] for line in lines))
-    ).reshape(-1, 2)
+    ends = np.zeros((1, 2))
+    for path in run.glob("*.monitor.csv"):
+        columns = np.loadtxt(path, delimiter=",", skiprows=2, usecols=(2, 1), ndmin=2)
+        if (np.diff(columns[:, 0]) < 0).any():
+            raise SystemExit(f"{path}: the run was resumed, and its clock began anew; measure one that was not.")
+        ends = np.concatenate([ends, columns])
+    ends = ends[np.argsort(ends[:, 0], kind="stable")]
     ends[:, 1] = np.cumsum(ends[:, 1])
-    return np.concatenate([np.zeros((1, 2)), ends])
+    return ends
 
 
 def curve(run: Path) -> list[dict[str, Any]]:

@@ -215,7 +215,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
                 f"{name}.load(path, dataset=...) or model.set_dataset(...)."
             )
         if self.env is not None:
-            self.time_limit = time_limit(self.env)
+            self.time_limit = time_limit(self.env, self.time_limit)
         known = {"action_space": getattr(self, "action_space", None), "max_episode_steps": self.time_limit}
         with first_of_each_machine_first():
             buffer = load_dataset(self.dataset, **{**known, **(self.dataset_kwargs or {})})
@@ -358,6 +358,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         model.policy.set_weight_decay(model.weight_decay)  # the optimiser's state in the file brings that of its own
         if env is not None:
             model.set_env(env, force_reset)
+            model.set_random_seed(model.seed)  # the environments', too
         return model
 
     def set_parameters(

@@ -36,6 +36,7 @@ COUNTERS: dict[str, Rule] = {
     "n_envs": COUNT,
     "max_timestep": COUNT,
     "time_limit": COUNT._replace(optional=True),
+    "_n_left": WHOLE,
     "verbose": WHOLE,
 }
 # Of the policy's tensors.

@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 import yaml
 
 from sb3_dtfm.algorithms import ALGORITHMS
-from sb3_dtfm.zoo.arguments import UsageError
+from sb3_dtfm.zoo.arguments import WRAPPER, UsageError
 from sb3_dtfm.zoo.registration import packaged_config, policy_of, with_policy_options
 
-WRAPPER = "sb3_dtfm.envs.ReturnToGoWrapper"
 PROFILES = {"paper": None, "small": "small"}
 # Keys of the grid; a profile or `-params` that sets them would contradict it.
 GRID_KEYS = ("dataset_fraction", "dataset_seed", "seed")

@@ -17,6 +17,8 @@ from sb3_dtfm.data.inspection import Inspection, Range, inspect_buffer
 from sb3_dtfm.envs import register_gymnasium_robotics
 
 BLUE, RED, GREY = "#1b6ca8", "#c0562b", "0.6"
+# Options that choose among episodes by what they come to.
+CHOOSING = {"min_return", "best_share", "success_only"}
 # Discrete actions that are counted in the table, the most frequent ones.
 N_CHOICES = 10
 # Episodes whose rewards are drawn.
@@ -42,18 +44,18 @@ def main(argv: Sequence[str]) -> None:
 
 def load(dataset: str | list[str], options: dict[str, Any]) -> TrajectoryBuffer:
     """
-    A dataset as its task would learn from it: up to the time limit, where the task is known here.
+    A dataset as its task would learn from it: up to the time limit, where the task is known here, and the best of that.
 
     :param dataset: Minari id, file, or several of them
     :param options: of its reader
     """
-    buffer = load_dataset(dataset, **options)
+    buffer = load_dataset(dataset, **{name: value for name, value in options.items() if name not in CHOOSING})
     register_gymnasium_robotics()
     spec = gym.registry.get(buffer.env_id or "")
     limit = None if spec is None else spec.max_episode_steps
-    if limit is None or "max_episode_steps" in options or buffer.episode_lengths.max() <= limit:
-        return buffer
-    return load_dataset(dataset, max_episode_steps=limit, **options)
+    longer = limit is not None and buffer.episode_lengths.max() > limit
+    as_learned = {**({"max_episode_steps": limit} if longer else {}), **options}
+    return buffer if as_learned.keys() <= options.keys() - CHOOSING else load_dataset(dataset, **as_learned)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -21,6 +21,12 @@ from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory,
 from sb3_dtfm.files import replacing
 
 
+def with_npz(path: str | os.PathLike[str]) -> Path:
+    """The file that :meth:`TrajectoryBuffer.save` writes: `.npz` is added where it is missing."""
+    path = Path(path)
+    return path if path.suffix == ".npz" else path.with_name(f"{path.name}.npz")
+
+
 class TrajectoryBuffer(FlatSteps):
     """
     Steps of episodes in flat float32 tensors, sampled as windows that may end at any step.
@@ -178,7 +184,8 @@ class TrajectoryBuffer(FlatSteps):
     def within(self, max_episode_steps: int) -> "TrajectoryBuffer":
         """
         A buffer of what an environment with such a time limit would have shown: of longer episodes the first steps, which
-        count as truncated, and returns of these. Whether one has succeeded by then, the data do not tell.
+        count as truncated, and returns of these. Whether one that succeeded had by then, the data do not tell; one that
+        did not had not.
 
         :param max_episode_steps: steps of an episode, at least 1
         :return: on the same flat tensors, but for the returns-to-go; the buffer itself where no episode is longer
@@ -197,7 +204,7 @@ class TrajectoryBuffer(FlatSteps):
         )
         table = EpisodeTable(*(column.copy() for column in self.episodes))
         table.lengths[longer], table.terminated[longer], table.truncated[longer] = max_episode_steps, False, True
-        table.successes[longer] = np.nan
+        table.successes[longer[table.successes[longer] == 1.0]] = np.nan
         changed = copy.copy(self)
         changed.returns_to_go = self.returns_to_go.clone()
         for episode in longer:
@@ -342,8 +349,7 @@ class TrajectoryBuffer(FlatSteps):
         :param path: of the file; `.npz` is added where it is missing
         :raises OSError: it cannot be written; what was there before still is
         """
-        path = Path(path)
-        path = path if path.suffix == ".npz" else path.with_name(f"{path.name}.npz")
+        path = with_npz(path)
         rows, stops = self.rows, self._stops.cpu().numpy()
         ended = {name: np.zeros(len(self), bool) for name in ("terminations", "truncations")}
         ended["terminations"][stops - 1], ended["truncations"][stops - 1] = self.terminated, self.truncated

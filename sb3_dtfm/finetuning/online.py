@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from sb3_dtfm.algorithms import DTFM
 from sb3_dtfm.arguments import COUNT, POSITIVE, Rule, check_arguments
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer, load_dataset
+from sb3_dtfm.data.buffer import with_npz
 from sb3_dtfm.distributed import DataParallel, n_processes
 from sb3_dtfm.envs import OBSERVATION, return_to_go_space
 from sb3_dtfm.envs.success import reported_success
@@ -71,6 +72,7 @@ class OnlineDTFM(DTFM):
         self._began: list[int] = []  # where each environment's episode begins in them
         self._state: tuple[np.ndarray, ...] | None = None  # of acting
         self._turn_start = 0  # in gradient steps
+        self._n_left = 0  # gradient steps of a turn that was interrupted
         super().__init__(*args, **kwargs)
 
     def _check_arguments(self, learning_rate: Rule) -> None:
@@ -78,8 +80,8 @@ class OnlineDTFM(DTFM):
         vars(self).update(check_arguments(vars(self), ACCEPTED))
 
     def _excluded_save_params(self) -> list[str]:
-        """Also what a DTFM, whose file it is saved as, does not have."""
-        return [*super()._excluded_save_params(), *ACCEPTED, "own", "_running", "_began", "_state", "_turn_start"]
+        """Also what is kept in a file of its own, or belongs to the environments."""
+        return [*super()._excluded_save_params(), "own", "_running", "_began", "_state", "_turn_start"]
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         """SB3's own, for the environments count here."""
@@ -131,13 +133,15 @@ class OnlineDTFM(DTFM):
         parallel = DataParallel(self.policy, self._loss_function(), self.batch_size)
         self._training_seed = self._choose_training_seed()
         callback.on_training_start(locals(), globals())
+        if self._n_left and self.own is not None:
+            self._imitate(parallel, self._n_left)
         n_turns = 0
         while self.num_timesteps < total_timesteps:
             # Of a turn's beginning: it ends with an episode, and the last one so beyond the steps that were asked for.
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
             if not self._collect(callback):
                 break
-            self._imitate(parallel)
+            self._imitate(parallel, self.gradient_steps)
             n_turns += 1
             if log_interval and n_turns % log_interval == 0:
                 self.dump_logs()
@@ -167,24 +171,21 @@ class OnlineDTFM(DTFM):
         :return: False where a callback ends the training
         """
         assert self.env is not None
-        ended: list[Trajectory] = []
-        goes_on = True
+        n_ended, goes_on = 0, True
         callback.on_rollout_start()
-        try:
-            while goes_on and len(ended) < self.n_episodes:
-                observations: Any = self._last_obs
-                actions, self._state = self.policy.predict(observations, self._state, self._last_episode_starts)
-                self._last_obs, rewards, dones, infos = self.env.step(actions)  # type: ignore[assignment]
-                self._last_episode_starts = dones
-                self._running.append(Step(observations[OBSERVATION], actions, rewards))
-                self._update_info_buffer(infos, dones)
-                ended += [self._take(row, infos[row]) for row in np.flatnonzero(dones)]
-                self.num_timesteps += self.n_envs
-                callback.update_locals(locals())
-                goes_on = callback.on_step()
-        finally:  # also what an interrupt ends
-            if ended:
-                self._keep(ended)
+        while goes_on and n_ended < self.n_episodes:
+            observations: Any = self._last_obs
+            actions, self._state = self.policy.predict(observations, self._state, self._last_episode_starts)
+            self._last_obs, rewards, dones, infos = self.env.step(actions)  # type: ignore[assignment]
+            self._last_episode_starts = dones
+            self._running.append(Step(observations[OBSERVATION], actions, rewards))
+            self._update_info_buffer(infos, dones)
+            if dones.any():  # at once, so that a checkpoint has all
+                self._keep([self._take(row, infos[row]) for row in np.flatnonzero(dones)])
+                n_ended += int(dones.sum())
+            self.num_timesteps += self.n_envs
+            callback.update_locals(locals())
+            goes_on = callback.on_step()
         callback.on_rollout_end()
         n_past = min(self._began)
         self._running, self._began = self._running[n_past:], [began - n_past for began in self._began]
@@ -221,23 +222,31 @@ class OnlineDTFM(DTFM):
             raise ValueError("There are no own episodes to save yet.")
         self.own.save(path)
 
-    def load_replay_buffer(self, path: str | PathLike[str]) -> None:
+    def load_replay_buffer(self, path: str | PathLike[str], truncate_last_traj: bool = True) -> None:
         """
         Take up own episodes of an earlier run.
 
-        :param path: what :meth:`save_replay_buffer` wrote
+        :param path: what :meth:`save_replay_buffer` was given
+        :param truncate_last_traj: SB3's; episodes that had not ended are not there
         :raises DatasetError: it cannot be read, or does not fit the model
         """
+        path = with_npz(path)
         own = load_dataset(path, action_space=self.action_space)
         self._check_spaces(return_to_go_space(own.observation_space), own.action_space, f"{path} holds", "the model's are")
         self.own = own.to(self.device)
 
-    def _imitate(self, parallel: DataParallel) -> None:
-        """The gradient steps of a turn; what acting has kept of the old weights' keys and values goes."""
+    def _imitate(self, parallel: DataParallel, n_steps: int) -> None:
+        """
+        The gradient steps of a turn; what acting has kept of the old weights' keys and values goes.
+
+        :param n_steps: less than `gradient_steps` where others have been taken before an interrupt
+        """
         batches = self._imitated()
-        self._turn_start = self._n_updates
-        for _ in range(self.gradient_steps):
+        self._turn_start = self._n_updates - (self.gradient_steps - n_steps)
+        self._n_left = n_steps
+        while self._n_left:
             self._train_step(batches, parallel)
+            self._n_left -= 1
         if self._state is not None:
             context = Context(*self._state)
             self._state = tuple(context._replace(keys_values=np.zeros((len(context.mask), 0), np.float32)))
@@ -250,6 +259,8 @@ class OnlineDTFM(DTFM):
         successes, returns = self.own.successes, self.own.episode_returns
         worthy = np.flatnonzero(np.where(np.isnan(successes), returns >= average, successes == 1.0))
         imitated = self.own.select(worthy) if len(worthy) else None
+        if imitated is not None and self.return_steps is not None:
+            imitated = imitated.to("cpu").with_expected_returns(self.return_steps, self.dataset_seed).to(self.device)
         n_own = self._n_own(imitated, self.batch_size) if imitated is not None else 0
         streams = [self._batches(self.buffer, self.batch_size - n_own)] if n_own < self.batch_size else []
         if imitated is not None:

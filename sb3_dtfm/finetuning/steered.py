@@ -6,6 +6,7 @@ from typing import Any, NoReturn
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
 from sb3_dtfm.algorithms import DTFM
@@ -87,14 +88,11 @@ def _take_over(agent: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, th.Tenso
     name = next((each.__name__ for each in type(agent).__mro__ if each.__name__ in SQUASHED), None)
     if name is None:
         _refuse(agent, f"it is a {type(agent).__name__}")
-    env = agent.get_env()
-    while env is not None and not isinstance(env, NoiseActionVecEnv):
-        if getattr(env, "norm_obs", False):
-            _refuse(agent, "VecNormalize stands between its actor and the noise's environment, which is normalised already")
-        env = getattr(env, "venv", None)
-    if env is None:
-        _refuse(agent, "it does not learn in a NoiseActionVecEnv")
+    env = _noise_env(agent)
     policy: Any = agent.policy
+    extractor = policy.actor.features_extractor if SQUASHED[name] else policy.pi_features_extractor
+    if type(extractor) is not FlattenExtractor:
+        _refuse(agent, f"it sees features of a {type(extractor).__name__}")
     if getattr(agent, "use_sde", False):
         _refuse(agent, "its exploration depends on the state (use_sde)")
     latent, mean, log_std = (
@@ -122,6 +120,25 @@ def _take_over(agent: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, th.Tenso
     else:  # the same for all observations
         weights |= {"log_std.weight": th.zeros_like(mean.weight), "log_std.bias": log_std.detach()}
     return settings, weights
+
+
+def _noise_env(agent: BaseAlgorithm) -> NoiseActionVecEnv:
+    """
+    The environment that an agent learns in, whose observations it sees as they are.
+
+    :raises ValueError: another environment, or something between
+    """
+    env: Any = agent.get_env()
+    while env is not None and not isinstance(env, NoiseActionVecEnv):
+        if getattr(env, "norm_obs", False):
+            _refuse(agent, "VecNormalize stands between its actor and the noise's environment, which is normalised already")
+        env = getattr(env, "venv", None)
+    if env is None:
+        _refuse(agent, "it does not learn in a NoiseActionVecEnv")
+    if agent.observation_space.shape != env.observation_space.shape:
+        found = f"{agent.observation_space.shape}, and the NoiseActionVecEnv shows {env.observation_space.shape}"
+        _refuse(agent, f"it sees observations of {found}")
+    return env
 
 
 def _refuse(agent: BaseAlgorithm, why: str) -> NoReturn:

@@ -32,7 +32,7 @@ class ExportedPolicy(nn.Module):
 
     def __init__(self, policy: SequencePolicy) -> None:
         super().__init__()
-        if policy.n_candidates > 1:
+        if policy.n_candidates > 1 and policy.steering is None:
             raise ValueError(
                 f"n_candidates={policy.n_candidates}: a choice by the critic is not exported; `n_candidates:1` among the "
                 "ways of acting exports the flow alone."

@@ -376,7 +376,18 @@ class SequencePolicy(ActingPolicy):
             action_space=self.action_space,
             lr_schedule=self._dummy_schedule,  # not needed to act
         )
-        return {**spaces_and_schedule, **self._constructor_arguments, **self.acting_settings()}
+        return {**spaces_and_schedule, **self._constructor_arguments}  # how it acts is among the weights
+
+    def save(self, path: str) -> None:
+        """
+        SB3's: the policy alone.
+
+        :param path: file to write
+        :raises ValueError: it is steered, which only the model's own file can hold
+        """
+        if self.steering is not None:
+            raise ValueError("A steered policy is saved with its model: model.save(path).")
+        super().save(path)
 
 
 def _own_parameters() -> set[str]:

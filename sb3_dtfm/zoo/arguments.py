@@ -15,6 +15,8 @@ from sb3_dtfm.envs import register_gymnasium_robotics
 from sb3_dtfm.finetuning import STEERED
 from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, packaged_config
 
+# In a run's settings.
+WRAPPER = "sb3_dtfm.envs.ReturnToGoWrapper"
 TRAIN_EXAMPLES = """\
   sb3-dtfm train --algo dtfm --env HalfCheetah-v5
   sb3-dtfm train --algo dt --env robosuite/Lift-v0 --conf-file small --dataset lift.hdf5 --dataset-fraction 0.5
@@ -155,7 +157,7 @@ def _check_task(conf_file: str, env_id: str, hyperparams: Sequence[str]) -> None
 
 def _shorthands(options: argparse.Namespace, given: dict[str, Any]) -> list[tuple[str, str]]:
     """Pairs of an option that was given and its `key:value`, whose value RL-Zoo evaluates as Python."""
-    wrapper = [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": options.target_return}}]
+    wrapper = [{WRAPPER: {"target_return": options.target_return}}]
     cached = {**(given.get("dataset_kwargs") or {}), "cache_dir": options.dataset_cache}
     dataset = options.dataset[0] if options.dataset and len(options.dataset) == 1 else options.dataset
     candidates = [

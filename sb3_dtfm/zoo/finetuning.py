@@ -21,7 +21,7 @@ from sb3_dtfm.files import read_run
 from sb3_dtfm.finetuning import STEERED, NoiseActionVecEnv, OnlineDTFM, SteeredDTFM
 from sb3_dtfm.finetuning.noise_env import STEERED_SOLVER_STEPS
 from sb3_dtfm.finetuning.online import ACCEPTED
-from sb3_dtfm.zoo.arguments import UsageError
+from sb3_dtfm.zoo.arguments import WRAPPER, UsageError
 from sb3_dtfm.zoo.manager import OF_RL_ZOO, OfflineExperimentManager
 from sb3_dtfm.zoo.resuming import EPISODES, StopSignals
 
@@ -95,6 +95,23 @@ def has_learned(agent: BaseAlgorithm) -> bool:
     return getattr(agent, "_n_updates", 0) > 0
 
 
+def asking_for(target_return: float, env_wrapper: Any) -> list[Any]:
+    """
+    :param target_return: that the environment is to ask for
+    :param env_wrapper: RL-Zoo's setting: a wrapper's path, one with its arguments, or a list of these
+    :return: the same wrappers, of which a ReturnToGoWrapper asks for it
+    """
+    wrappers = env_wrapper if isinstance(env_wrapper, list) else [env_wrapper]
+    by_path = {
+        path: arguments
+        for each in wrappers
+        for path, arguments in (each if isinstance(each, dict) else {each: None}).items()
+    }
+    path = next((path for path in by_path if path.rsplit(".")[-1] == WRAPPER.rsplit(".")[-1]), WRAPPER)
+    by_path[path] = {**(by_path.get(path) or {}), "target_return": target_return}
+    return [{path: arguments} for path, arguments in by_path.items()]
+
+
 class FinetuningManager(OfflineExperimentManager):
     """
     RL-Zoo's own manager, for what goes on from a DTFM in the environment of that DTFM's run.
@@ -103,7 +120,7 @@ class FinetuningManager(OfflineExperimentManager):
     :param target_return: to ask for; by default as in that run
     """
 
-    of_the_data: tuple[str, ...] = ()  # settings of that run that count here, too
+    of_the_data: tuple[str, ...] = ()  # and other settings of that run that count here, too
 
     def __init__(self, *args: Any, base: Path, target_return: float | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -117,13 +134,18 @@ class FinetuningManager(OfflineExperimentManager):
         hyperparams, _ = super().read_hyperparameters()
         run = self.base_file.parent / self.env_name
         known = read_run(run) if (run / "config.yml").is_file() else {}
+        if known.get("vec_env_wrapper") and "vec_env_wrapper" not in self.of_the_data:
+            raise UsageError(
+                f"--model {self.base}: it learned in {known['vec_env_wrapper']}, where an algorithm that steers needs a "
+                "NoiseActionVecEnv; --algo dtfm goes on in it."
+            )
         from_the_run = ["env_wrapper", *([] if self.env_kwargs else ["env_kwargs"])]  # of the command line, if given there
         from_the_run += self.of_the_data
         hyperparams = {**{key: known[key] for key in from_the_run if known.get(key)}, **hyperparams}
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = hyperparams.get("env_kwargs") or self.env_kwargs
         if self.target_return is not None:
-            hyperparams["env_wrapper"] = [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": self.target_return}}]
+            hyperparams["env_wrapper"] = asking_for(self.target_return, hyperparams.get("env_wrapper") or [])
         if not hyperparams.get("env_wrapper"):
             raise UsageError(f"--target-return: needed, as {self.base} does not tell what return was asked for.")
         return hyperparams, OrderedDict(sorted(hyperparams.items()))
@@ -143,6 +165,11 @@ class SteeringManager(FinetuningManager):
         if policy.network.head.noise_dim and not policy.network.head.noise_decides:
             policy.set_acting(n_solver_steps=STEERED_SOLVER_STEPS)
             print(f"The model acts by one Euler step, which no noise changes: n_solver_steps={STEERED_SOLVER_STEPS} instead")
+        if policy.n_candidates > 1:
+            print(
+                f"The model's critic chooses among {policy.n_candidates} draws; here an algorithm chooses the noise of one"
+            )
+            policy.set_acting(n_candidates=1)
         name = Path(self.save_path).name.removeprefix(f"{self.env_name}_")
         uuid = name.lstrip("0123456789")
         self.log_path = f"{self.log_folder}/{STEERED}/"
@@ -240,7 +267,7 @@ class OnlineManager(FinetuningManager):
     """
 
     command = "finetune"
-    of_the_data = ("dataset", "dataset_fraction", "dataset_seed", "dataset_kwargs")
+    of_the_data = ("dataset", "dataset_fraction", "dataset_seed", "dataset_kwargs", "vec_env_wrapper")
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

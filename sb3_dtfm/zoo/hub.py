@@ -16,10 +16,9 @@ from huggingface_sb3 import EnvironmentName, ModelName, ModelRepoId
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.files import replacing
-from sb3_dtfm.zoo.arguments import UsageError
+from sb3_dtfm.zoo.arguments import WRAPPER, UsageError
 
 CARD, SETTINGS, RESULTS, VIDEO = "README.md", "settings.json", "results.json", "replay.mp4"
-WRAPPER = "sb3_dtfm.envs.ReturnToGoWrapper"
 LARGEST_SETTINGS = 1_000_000  # bytes
 
 

@@ -11,6 +11,7 @@ from sb3_dtfm import DTFM
 from sb3_dtfm.cli.main import main
 from sb3_dtfm.data import load_dataset
 from sb3_dtfm.finetuning import OnlineDTFM, SteeredDTFM
+from sb3_dtfm.zoo.finetuning import asking_for
 from tests.recorded import DATASET_ID, tiny_training
 
 EVALUATIONS = ["--eval-freq", "10", "--eval-episodes", "2"]
@@ -24,6 +25,19 @@ def run(workplace):
     chunks = "policy_kwargs:dict(embed_dim=16,n_layers=1,n_heads=1,flow_hidden_dim=16,flow_n_layers=1,chunk_size=4)"
     assert main(tiny_training("dtfm", "dataset:" + repr(DATASET_ID), chunks)) == 0
     return workplace / "logs/dtfm/HalfCheetah-v5_1"
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ([], [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 9.0}}]),
+        (["my.Repeat", {"a.ReturnToGoWrapper": {"target_return": 5}}, {"my.Scale": {"by": 2}}],
+         [{"my.Repeat": None}, {"a.ReturnToGoWrapper": {"target_return": 9.0}}, {"my.Scale": {"by": 2}}]),
+        ("my.Repeat", [{"my.Repeat": None}, {"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 9.0}}]),
+    ],
+)  # fmt: skip
+def test_another_target_leaves_the_other_wrappers(before, after):
+    assert asking_for(9.0, before) == after
 
 
 def test_a_run_is_finetuned_and_played(run, workplace, capsys):

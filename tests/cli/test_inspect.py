@@ -104,5 +104,8 @@ def test_what_lies_behind_the_task_s_time_limit_is_not_counted(workplace, capsys
     assert "| steps | 1,000; an episode has 200 to 200" in text
     assert "best: 0, 0.32, 1.6, 2.88, 3.2 |" in text
     assert "--target-return 3.2" in text
+    with pytest.warns(UserWarning, match="5 of 5 episodes"):
+        assert main(["inspect", "long.npz", "--dataset-kwargs", "min_return:3"]) == 0
+    assert "| episodes | 1: " in capsys.readouterr().out, "of 250 steps three episodes had such a return"
     assert main(["inspect", "long.npz", "--dataset-kwargs", "max_episode_steps:None"]) == 0
     assert "an episode has 250 to 250" in capsys.readouterr().out

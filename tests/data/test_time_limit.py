@@ -62,6 +62,15 @@ def test_an_end_behind_the_limit_is_not_learned_as_one():
     np.testing.assert_array_equal(buffer.successes, [np.nan, 1.0])
 
 
+def test_what_failed_with_more_time_had_failed_by_then():
+    """So data of successes within the limit and of failures beyond it can be chosen from."""
+    lengths = {3: True, 4: True, 9: False}
+    episodes = [make_trajectory(length, success=success) for length, success in lengths.items()]
+    buffer = TrajectoryBuffer.from_trajectories(episodes, ACTION_SPACE)
+    with pytest.warns(UserWarning, match="6 steps"):
+        assert load_dataset(buffer, max_episode_steps=6, success_only=True).episode_lengths.tolist() == [3, 4]
+
+
 def test_nothing_changes_where_no_episode_is_longer():
     buffer = make_buffer(LENGTHS)
     with warnings.catch_warnings():
@@ -107,6 +116,17 @@ def test_a_loaded_model_knows_the_time_limit_that_it_learned_for(cheetah_buffer,
     assert model.buffer.episode_lengths.tolist() == [20] * cheetah_buffer.n_episodes
     model = DT.load(tmp_path / "model.zip", dataset=cheetah_buffer, dataset_kwargs={"max_episode_steps": None}).learn(1)
     assert model.buffer.episode_lengths.max() == EPISODE_LENGTH
+
+
+@pytest.mark.filterwarnings("ignore:.*max_episode_steps")
+def test_an_environment_that_tells_of_no_limit_leaves_the_models(cheetah_buffer, tmp_path):
+    env = ReturnToGoWrapper(gym.make("HalfCheetah-v5", max_episode_steps=20), target_return=0.0)
+    make_model(DT, cheetah_buffer, env=env).save(tmp_path / "model.zip")
+    limitless, silent = (gym.make("HalfCheetah-v5", max_episode_steps=-1).unwrapped for _ in range(2))
+    silent.spec = None
+    for bare, longest in ((limitless, EPISODE_LENGTH), (silent, 20)):
+        model = DT.load(tmp_path / "model.zip", ReturnToGoWrapper(bare, target_return=0.0), dataset=cheetah_buffer)
+        assert model.learn(1).buffer.episode_lengths.max() == longest
 
 
 def test_without_an_environment_nothing_is_left_out():

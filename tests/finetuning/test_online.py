@@ -127,12 +127,38 @@ def test_what_it_saves_is_a_dtfm(model, tmp_path, cheetah_buffer):
     assert OnlineDTFM.load(tmp_path / "online.zip", make_venv(), dataset=cheetah_buffer, **ONLINE).learn(30).own is not None
 
 
+def test_what_a_turn_is_stays_in_its_file(model, tmp_path, cheetah_buffer):
+    model.save(tmp_path / "online.zip")
+    loaded = OnlineDTFM.load(tmp_path / "online.zip")
+    assert (loaded.n_episodes, loaded.gradient_steps) == (4, 2)
+
+
+def test_the_seed_is_the_environments_too(file, cheetah_buffer):
+    firsts = []
+    for _ in range(2):
+        venv = make_vec_env("HalfCheetah-v5", 2, wrapper_class=ReturnToGoWrapper, wrapper_kwargs=dict(target_return=1.0))
+        OnlineDTFM.load(file, venv, dataset=cheetah_buffer, **ONLINE)
+        firsts.append(venv.reset()[OBSERVATION])
+    np.testing.assert_array_equal(*firsts)
+
+
+def test_own_returns_are_expected_ones_as_the_datasets_are(file, cheetah_buffer):
+    model = OnlineDTFM.load(file, make_venv(), dataset=cheetah_buffer, return_steps=2, **ONLINE)
+    model.set_dataset(cheetah_buffer)
+    model.own = cheetah_buffer.best(best_share=0.2)
+    asked = []
+    model._batches = lambda buffer, *_: (asked.append(buffer.returns_to_go[buffer.rows]), iter(()))[1]
+    model._imitated()
+    _, own = asked
+    assert (own != model.own.returns_to_go[model.own.rows]).any()
+
+
 def test_own_episodes_are_saved_and_taken_up(model, tmp_path):
     with pytest.raises(ValueError, match="no own episodes"):
         model.save_replay_buffer(tmp_path / "own.npz")
-    model.learn(60).save_replay_buffer(tmp_path / "own.npz")
+    model.learn(60).save_replay_buffer(tmp_path / "own")
     before, model.own = model.own, None
-    model.load_replay_buffer(tmp_path / "own.npz")
+    model.load_replay_buffer(tmp_path / "own")
     for name in ("observations", "actions", "rewards", "returns_to_go"):
         th.testing.assert_close(getattr(model.own, name), getattr(before, name), rtol=0, atol=0)
     np.testing.assert_array_equal(model.own.successes, before.successes)
@@ -200,6 +226,32 @@ def test_episodes_that_had_ended_survive_an_interrupt(model):
     with pytest.raises(KeyboardInterrupt):
         model.learn(90, Interrupt())
     assert model.own.episode_lengths.tolist() == [4, 7, 4]
+
+
+def test_a_turn_that_was_interrupted_while_it_learned_is_learned_to_its_end(file, cheetah_buffer, tmp_path, monkeypatch):
+    settings = dict(ONLINE, gradient_steps=5)
+    model = OnlineDTFM.load(file, make_venv(), dataset=cheetah_buffer, **settings)
+    before, step = model._n_updates, OnlineDTFM._train_step
+
+    def interrupted(self, *args):
+        if self._n_updates == before + 2:
+            raise KeyboardInterrupt
+        step(self, *args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(OnlineDTFM, "_train_step", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            model.learn(9)
+    model.save(tmp_path / "checkpoint.zip")
+    model.save_replay_buffer(tmp_path / "own.npz")
+    rest = OnlineDTFM.load(tmp_path / "checkpoint.zip", make_venv(), dataset=cheetah_buffer)
+    rest.load_replay_buffer(tmp_path / "own.npz")
+    factors = []
+    monkeypatch.setattr(rest, "_update_learning_rate", lambda _: factors.append(rest._schedule_position()[0]))
+    n_steps = rest.num_timesteps
+    rest.learn(9 - n_steps, reset_num_timesteps=False)
+    assert (rest.num_timesteps, rest._n_updates) == (n_steps, before + 5)
+    assert factors == [2, 3, 4], "at the learning rates of the steps that were left"
 
 
 def test_kept_keys_and_values_are_those_of_the_present_weights(cheetah_buffer, tmp_path):

@@ -9,7 +9,8 @@ import pytest
 import torch as th
 from sb3_contrib import TQC
 from stable_baselines3 import A2C, PPO, SAC, TD3
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sb3_dtfm import DTFM
 from sb3_dtfm.files import ModelFileError
@@ -135,7 +136,18 @@ def test_later_weights_of_the_agent_are_taken_over_when_asked(model):
     th.testing.assert_close(steered.policy.steering.mean.weight, agent.actor.mu.weight.detach(), rtol=0, atol=0)
 
 
+class Hundredfold(BaseFeaturesExtractor):
+    """Of the width of what is seen."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space, observation_space.shape[0])
+
+    def forward(self, observations):
+        return 100.0 * observations
+
+
 def test_other_actors_are_refused_by_name(model):
+    stacked = VecFrameStack(NoiseActionVecEnv(make_venv(), model), 2)
     cases = [
         (make_agent(model, TD3), "The actor of TD3 cannot be taken over: it is a TD3"),
         (make_agent(model, use_sde=True), r"use_sde"),
@@ -144,6 +156,17 @@ def test_other_actors_are_refused_by_name(model):
         (
             SAC("MlpPolicy", VecNormalize(NoiseActionVecEnv(make_venv(), model)), device="cpu"),
             "VecNormalize stands between",
+        ),
+        (
+            SAC("MlpPolicy", stacked, device="cpu"),
+            r"it sees observations of \(38,\), and the NoiseActionVecEnv shows \(19,\)",
+        ),
+        *(
+            (
+                make_agent(model, algorithm, policy_kwargs=dict(features_extractor_class=Hundredfold)),
+                "features of a Hundredf",
+            )
+            for algorithm in (SAC, PPO)
         ),
     ]
     for agent, message in cases:
@@ -218,3 +241,12 @@ def test_a_steering_goes_before_a_critics_choice(cheetah_buffer):
     steered.policy.set_acting(n_candidates=1)
     alone, _ = steered.predict(observations, deterministic=True, episode_start=np.ones(len(chosen), bool))
     np.testing.assert_array_equal(chosen, alone)
+    steered.policy.set_acting(n_candidates=8)
+    exported = ExportedPolicy(steered.policy)
+    assert exported.steering is not None, "no critic chooses"
+
+
+def test_a_steered_policy_without_its_model_is_not_saved(model, agent, tmp_path):
+    with pytest.raises(ValueError, match=r"saved with its model: model\.save"):
+        SteeredDTFM.of(model, agent).policy.save(str(tmp_path / "policy.pt"))
+    assert not list(tmp_path.iterdir())

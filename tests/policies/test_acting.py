@@ -177,6 +177,17 @@ def test_a_policy_saves_and_loads_alone(model, tmp_path):
     assert np.array_equal(roll_plain(loaded, 8), roll_plain(model, 8))
 
 
+def test_a_policy_alone_acts_and_values_as_it_did(cheetah_buffer, tmp_path):
+    """How many actions are carried out may have been changed since the critic learned to value so many."""
+    kwargs = dict(TINY_FLOW_POLICY, chunk_size=4, critic_steps=1)
+    model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=kwargs)
+    model.policy.set_acting(n_action_steps=1, n_candidates=3)
+    model.policy.save(str(tmp_path / "policy.pt"))
+    loaded = DTFMPolicy.load(str(tmp_path / "policy.pt"))
+    assert loaded.acting_settings() == model.policy.acting_settings()
+    assert loaded.n_valued == model.policy.n_valued == 2
+
+
 def test_solver_can_be_changed_after_training(cheetah_buffer):
     model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=TINY_FLOW_POLICY, seed=0, ema_decay=0.9)
     assert isinstance(model.policy, DTFMPolicy)
