@@ -198,13 +198,14 @@ class EvaluationCallback(BaseCallback):
     def _on_training_start(self) -> None:
         self._resumed = time.perf_counter()
         if self.num_timesteps == 0:
+            self.rows.unlink(missing_ok=True)  # of an attempt that was killed before its first checkpoint
             self._evaluate(final=False)
         else:
             self._take_up_rows()
 
     def _take_up_rows(self) -> None:
         """Those of an interrupted run up to its checkpoint; steps behind the last row took as long as those before it."""
-        rows = [row for row in read_rows(self.rows) if row["step"] <= self.num_timesteps]
+        rows = [row for row in read_rows(self.rows, torn_end=True) if row["step"] <= self.num_timesteps]
         with replacing(self.rows) as beside:
             for row in rows:
                 write_row(beside, row)

@@ -1,6 +1,7 @@
 """The cells that a grid asks for."""
 
 import argparse
+import json
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -10,7 +11,7 @@ import gymnasium as gym
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.provenance import describe_data
-from sb3_dtfm.benchmark.rows import Cell, finished_cells, read_rows
+from sb3_dtfm.benchmark.rows import Cell, Row, read_rows
 from sb3_dtfm.benchmark.settings import Task, check_same_trunk, profile_name, read_yaml, task_settings
 from sb3_dtfm.zoo.arguments import UsageError
 
@@ -98,7 +99,7 @@ def plan(options: argparse.Namespace) -> tuple[list[Job], list[Cell]]:
     :raises DatasetError: a dataset that cannot be read, or of another task
     """
     files = sorted(Path(options.results).rglob("*.jsonl"))  # in studies, too
-    finished = finished_cells(row for file in files for row in read_rows(file))
+    finished = {Cell.of(row): row for file in files for row in read_rows(file) if row["final"]}
     profile = profile_name(options.profile)
     data: dict[str, dict[str, Any]] = {}
     jobs: list[Job] = []
@@ -113,7 +114,7 @@ def plan(options: argparse.Namespace) -> tuple[list[Job], list[Cell]]:
         for algo in options.algos:
             cell, wanted = Cell(task.env_id, regime, algo, seed, profile, options.label), settings[algo]
             if cell in finished:
-                _check_length(cell, finished[cell], wanted["n_timesteps"], options.results)
+                _check_same(cell, finished[cell], wanted, options)
                 done.append(cell)
                 continue
             if (rows := Path(options.results) / f"{cell.file_name}.jsonl") in files:
@@ -126,8 +127,17 @@ def plan(options: argparse.Namespace) -> tuple[list[Job], list[Cell]]:
     return jobs, done
 
 
-def _check_length(cell: Cell, found: int, wanted: int, folder: str) -> None:
-    if found != wanted:
-        raise UsageError(
-            f"{cell}: {folder} has it with {found} gradient steps, {wanted} are asked for; use another --label or --results."
-        )
+def _check_same(cell: Cell, found: Row, wanted: dict[str, Any], options: argparse.Namespace) -> None:
+    """
+    Refuse to take a finished cell for one of other settings.
+
+    :param found: its final row
+    :param wanted: its settings now
+    :raises UsageError: names what differs
+    """
+    there = {**found["settings"], "n_timesteps": found["step"], "--final-episodes": len(found["returns"])}
+    now = {**json.loads(json.dumps(wanted)), "--final-episodes": options.final_episodes}
+    differing = sorted(key for key in {*there, *now} if there.get(key) != now.get(key))
+    if differing:
+        changes = ", ".join(f"{key} {there.get(key)!r} instead of {now.get(key)!r}" for key in differing)
+        raise UsageError(f"{cell}: {options.results} has it with {changes}; use another --label or --results.")

@@ -112,15 +112,18 @@ def write_row(path: Path, row: Row) -> None:
         file.write(json.dumps(check_row(row), allow_nan=False) + "\n")
 
 
-def read_rows(path: Path) -> list[Row]:
+def read_rows(path: Path, torn_end: bool = False) -> list[Row]:
     """
     All rows of one file.
 
+    :param torn_end: leave out what a kill has left of a last line
     :raises RowError: names the line that is wrong
     """
     rows = []
     with path.open() as file:
         for number, line in enumerate(file, start=1):
+            if torn_end and not line.endswith("\n"):
+                break
             try:
                 if line.strip():
                     rows.append(check_row(json.loads(line, parse_constant=_refuse)))

@@ -59,7 +59,6 @@ class Runner:
 
     def run(self) -> None:
         """Run all cells; one that fails does not stop the others, an interrupt ends them."""
-        (self.results / ".locks").mkdir(parents=True, exist_ok=True)
         with self._bar, ThreadPoolExecutor(self.options.jobs) as pool:
             cells = [pool.submit(self._run_cell, job) for job in self.jobs]
             try:
@@ -73,7 +72,10 @@ class Runner:
         """Run a cell, unless another call of the command is at it or has finished it meanwhile."""
         name = job.cell.file_name
         try:
-            with FileLock(self.results / ".locks" / f"{name}.lock").acquire(timeout=0):
+            with contextlib.ExitStack() as locks:
+                for folder in (self.results, Path(self.options.log_folder)):  # which other calls may share
+                    (folder / ".locks").mkdir(parents=True, exist_ok=True)
+                    locks.enter_context(FileLock(folder / ".locks" / f"{name}.lock").acquire(timeout=0))
                 if (self.results / f"{name}.jsonl").exists():
                     self.done.append(job)
                 else:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from sb3_dtfm.algorithms import ALGORITHMS
-from sb3_dtfm.zoo.arguments import WRAPPER, UsageError
+from sb3_dtfm.zoo.arguments import UsageError, asking_for
 from sb3_dtfm.zoo.registration import packaged_config, policy_of, with_policy_options
 
 PROFILES = {"paper": None, "small": "small"}
@@ -105,7 +105,7 @@ def task_settings(
     if task.dataset is not None:
         settings["dataset"] = task.dataset
     if task.target_return is not None:
-        settings["env_wrapper"] = [{WRAPPER: {"target_return": task.target_return}}]
+        settings["env_wrapper"] = asking_for(task.target_return, settings.get("env_wrapper") or [])
     if n_timesteps is not None:
         settings["n_timesteps"] = n_timesteps
     needed = {"dataset": "--dataset", "env_wrapper": "--target-return", "n_timesteps": "--n-timesteps"}

@@ -45,13 +45,18 @@ def main(argv: Sequence[str]) -> None:
     )
     output = Path(options.output)
     agent_line = not options.no_agent_line
-    figures = {}
+    figures: dict[tuple[str, str], list[str]] = {}
+    taken: set[str] = set()
     for study in studies:
         for group in split_changes(study, studies)[0]:
+            curves, minutes, solved = (figure_name(kind, study, group) for kind in ("curves", "minutes", "solved"))
+            if curves in taken:
+                raise ValueError(f"{curves} would show two groups of {study.name}: a label has its folder's name.")
+            taken.add(curves)
             drawn = [
-                plot_group(group, output / figure_name("curves", study, group), "steps", baselines, agent_line),
-                plot_group(group, output / figure_name("minutes", study, group), "minutes", agent_line=agent_line),
-                plot_solved(group, output / figure_name("solved", study, group)),
+                plot_group(group, output / curves, "steps", baselines, agent_line),
+                plot_group(group, output / minutes, "minutes", agent_line=agent_line),
+                plot_solved(group, output / solved),
             ]
             figures[study.name, group.title] = [file.name for file in drawn if file is not None]
             print(*(file for file in drawn if file is not None), sep="\n")

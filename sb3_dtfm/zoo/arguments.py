@@ -27,6 +27,23 @@ class UsageError(ValueError):
     """Arguments that do not go together; the message says which would."""
 
 
+def asking_for(target_return: float, env_wrapper: Any) -> list[Any]:
+    """
+    :param target_return: that the environment is to ask for
+    :param env_wrapper: RL-Zoo's setting: a wrapper's path, one with its arguments, or a list of these
+    :return: the same wrappers, of which a ReturnToGoWrapper asks for it
+    """
+    wrappers = env_wrapper if isinstance(env_wrapper, list) else [env_wrapper]
+    by_path = {
+        path: arguments
+        for each in wrappers
+        for path, arguments in (each if isinstance(each, dict) else {each: None}).items()
+    }
+    path = next((path for path in by_path if path.rsplit(".")[-1] == WRAPPER.rsplit(".")[-1]), WRAPPER)
+    by_path[path] = {**(by_path.get(path) or {}), "target_return": target_return}
+    return [{path: arguments} for path, arguments in by_path.items()]
+
+
 def key_values(option: str, texts: Sequence[str]) -> dict[str, Any]:
     """
     Keys with their values, which RL-Zoo evaluates as Python.
@@ -110,6 +127,26 @@ def resumed_run(argv: Sequence[str]) -> tuple[Path | None, list[str]]:
     return options.resume, others
 
 
+def resumed_arguments(run: Path, started: list[str], others: Sequence[str]) -> list[str]:
+    """
+    Arguments for RL-Zoo's `train` of a run that goes on.
+
+    :param run: its folder
+    :param started: what it was started with
+    :param others: the user's arguments beside `--resume`: none, or all of them once more
+    :raises UsageError: others, of another algorithm or task
+    """
+    if not others:
+        return started
+    arguments = train_arguments(others)
+    of_the_run, given = (train_parser().parse_known_args(each)[0] for each in (started, arguments))
+    if (of_the_run.algo, of_the_run.env) != (given.algo, given.env):
+        raise UsageError(
+            f"--resume {run}: takes no other arguments; it was started with --algo {of_the_run.algo} --env {of_the_run.env}."
+        )
+    return arguments
+
+
 def train_arguments(argv: Sequence[str]) -> list[str]:
     """
     Arguments for RL-Zoo's `train`.
@@ -123,14 +160,15 @@ def train_arguments(argv: Sequence[str]) -> list[str]:
     if options.algo == STEERED:
         raise UsageError(f"--algo {STEERED}: such models come from `sb3-dtfm finetune`; `enjoy` plays them.")
     given = key_values("-params", options.hyperparams)
-    shorthands = _shorthands(options, given)
+    conf_file = options.conf_file
+    if options.algo in ALGORITHMS and conf_file in PACKAGED_CONFIGS:
+        conf_file = str(packaged_config(options.algo, conf_file))
+    shorthands = _shorthands(options, given, _wrappers(conf_file, options.env))
     if options.algo not in ALGORITHMS and shorthands:
         names = ", ".join(option for option, _ in shorthands)
         raise UsageError(f"{names}: for --algo {' and '.join(ALGORITHMS)} only, not for {options.algo}.")
     hyperparams = [*options.hyperparams, *(value for _, value in shorthands)]
-    conf_file = options.conf_file
-    if options.algo in ALGORITHMS and conf_file in PACKAGED_CONFIGS:
-        conf_file = str(packaged_config(options.algo, conf_file))
+    if options.algo in ALGORITHMS and options.conf_file in PACKAGED_CONFIGS:
         _check_task(conf_file, options.env, hyperparams)
     arguments = ["--algo", options.algo, "--env", options.env, *rest]
     if conf_file is not None:
@@ -155,9 +193,17 @@ def _check_task(conf_file: str, env_id: str, hyperparams: Sequence[str]) -> None
         raise UsageError(f"{', '.join(missing)}: needed for {env_id}, which {conf_file} does not list.")
 
 
-def _shorthands(options: argparse.Namespace, given: dict[str, Any]) -> list[tuple[str, str]]:
+def _wrappers(conf_file: str | None, env_id: str) -> Any:
+    """What wraps a task, as a YAML file has it; nothing in a file of another kind, or where there is none to read."""
+    if conf_file is None or not Path(conf_file).is_file() or Path(conf_file).suffix not in (".yml", ".yaml"):
+        return []
+    entries = yaml.safe_load(Path(conf_file).read_text()) or {}
+    return (entries.get(env_id) or entries.get("default") or {}).get("env_wrapper") or []
+
+
+def _shorthands(options: argparse.Namespace, given: dict[str, Any], wrappers: Any) -> list[tuple[str, str]]:
     """Pairs of an option that was given and its `key:value`, whose value RL-Zoo evaluates as Python."""
-    wrapper = [{WRAPPER: {"target_return": options.target_return}}]
+    wrapper = asking_for(options.target_return, given.get("env_wrapper") or wrappers)
     cached = {**(given.get("dataset_kwargs") or {}), "cache_dir": options.dataset_cache}
     dataset = options.dataset[0] if options.dataset and len(options.dataset) == 1 else options.dataset
     candidates = [

@@ -21,7 +21,7 @@ from sb3_dtfm.files import read_run
 from sb3_dtfm.finetuning import STEERED, NoiseActionVecEnv, OnlineDTFM, SteeredDTFM
 from sb3_dtfm.finetuning.noise_env import STEERED_SOLVER_STEPS
 from sb3_dtfm.finetuning.online import ACCEPTED
-from sb3_dtfm.zoo.arguments import WRAPPER, UsageError
+from sb3_dtfm.zoo.arguments import UsageError, asking_for
 from sb3_dtfm.zoo.manager import OF_RL_ZOO, OfflineExperimentManager
 from sb3_dtfm.zoo.resuming import EPISODES, StopSignals
 
@@ -93,23 +93,6 @@ class SteeredCallbacks(BaseCallback):
 def has_learned(agent: BaseAlgorithm) -> bool:
     """Whether an algorithm has done a gradient step."""
     return getattr(agent, "_n_updates", 0) > 0
-
-
-def asking_for(target_return: float, env_wrapper: Any) -> list[Any]:
-    """
-    :param target_return: that the environment is to ask for
-    :param env_wrapper: RL-Zoo's setting: a wrapper's path, one with its arguments, or a list of these
-    :return: the same wrappers, of which a ReturnToGoWrapper asks for it
-    """
-    wrappers = env_wrapper if isinstance(env_wrapper, list) else [env_wrapper]
-    by_path = {
-        path: arguments
-        for each in wrappers
-        for path, arguments in (each if isinstance(each, dict) else {each: None}).items()
-    }
-    path = next((path for path in by_path if path.rsplit(".")[-1] == WRAPPER.rsplit(".")[-1]), WRAPPER)
-    by_path[path] = {**(by_path.get(path) or {}), "target_return": target_return}
-    return [{path: arguments} for path, arguments in by_path.items()]
 
 
 class FinetuningManager(OfflineExperimentManager):
@@ -271,7 +254,6 @@ class OnlineManager(FinetuningManager):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.has_checkpoint = self.resumed is not None and self.continue_training
         if self.continue_training and not self.has_checkpoint:
             raise UsageError(f"-i {self.trained_agent}: --model names what goes on; its run's own episodes come with it.")
         if not self.has_checkpoint:

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import optuna
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -59,8 +60,9 @@ class OfflineExperimentManager(ExperimentManager):
             self.start = self.start._replace(tensorboard=Start.read(resumed, self.command).tensorboard)
             if is_first_process():  # what others write is not kept
                 self.save_path, self.params_path = str(resumed), str(resumed / self.env_name)
-            self.trained_agent = str(resumed / CHECKPOINT)
-            self.continue_training = (resumed / CHECKPOINT).is_file()  # else it was killed before the first one
+        self.has_checkpoint = resumed is not None and (resumed / CHECKPOINT).is_file()  # else it begins anew
+        if resumed is not None and self.has_checkpoint:
+            self.trained_agent, self.continue_training = str(resumed / CHECKPOINT), True
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """RL-Zoo's; options of the policy may stand beside the algorithm's."""
@@ -77,7 +79,8 @@ class OfflineExperimentManager(ExperimentManager):
         except BaseException as error:
             with contextlib.suppress(OSError):  # not made yet, or no longer empty: then it is a run's
                 os.rmdir(self.params_path)
-                shutil.rmtree(self.save_path)
+                if self.resumed is None:
+                    shutil.rmtree(self.save_path)
             if isinstance(error, TypeError):
                 self._check_names(error)
             raise
@@ -92,12 +95,22 @@ class OfflineExperimentManager(ExperimentManager):
         if unknown:
             raise UsageError(f"{with_nearest(unknown, known)}: no hyperparameter of {self.algo}.") from error
 
+    def objective(self, trial: optuna.Trial) -> float:
+        """RL-Zoo's, of a search; a trial that diverges or needs too much memory is one without a value."""
+        try:
+            return super().objective(trial)
+        except (FloatingPointError, MemoryError) as error:
+            raise optuna.TrialPruned(str(error)) from error
+
     def create_callbacks(self) -> None:
         """RL-Zoo's, and the evaluations that a count of full intervals leaves out."""
         if not is_first_process():
             self.callbacks = []
             return
+        n_envs, counts_gradient_steps = self.n_envs, self.algo in ALGORITHMS and self.command == "train"
+        self.n_envs = 1 if counts_gradient_steps else n_envs  # by which RL-Zoo divides the intervals
         super().create_callbacks()
+        self.n_envs = n_envs
         if self.algo not in ALGORITHMS or self.optimize_hyperparameters:
             return
         evaluations = [callback for callback in self.callbacks if isinstance(callback, EvalCallback)]
@@ -116,6 +129,8 @@ class OfflineExperimentManager(ExperimentManager):
         learning = model
         try:
             if self.resumed is not None:
+                if not self.has_checkpoint:
+                    model.num_timesteps = 0  # those of the agent that it began with are not its own
                 go_on(model, self.callbacks, self.start)
                 self.n_timesteps -= model.num_timesteps
                 learn = functools.partial(model.learn, reset_num_timesteps=model.num_timesteps == 0)

@@ -131,7 +131,7 @@ class KeepCheckpoint(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._saved_at = time.monotonic()
-        self.start._replace(tensorboard=self.logger.dir).write(self.path.parent)
+        self.start._replace(tensorboard=self.logger.dir if self.model.tensorboard_log else None).write(self.path.parent)
 
     def _on_step(self) -> bool:
         if self._ending:

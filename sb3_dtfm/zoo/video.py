@@ -14,7 +14,7 @@ import matplotlib as mpl
 from huggingface_sb3 import EnvironmentName, ModelName
 from imageio_ffmpeg import get_ffmpeg_exe
 
-from sb3_dtfm.files import replacing
+from sb3_dtfm.files import read_run, replacing
 from sb3_dtfm.zoo.arguments import UsageError
 from sb3_dtfm.zoo.commands import FoundModel, find_model, record_video
 from sb3_dtfm.zoo.rendering import drawing
@@ -57,12 +57,29 @@ def film(models: Sequence[FoundModel], arguments: Sequence[str], output: Path) -
             part = Path(folder, str(i))
             print(f"Filming {model.path}")
             with contextlib.redirect_stdout(io.StringIO()):  # it names files that do not stay
-                record_video(model, [*arguments, "--output-folder", str(part), "--no-render"])  # else it draws twice
+                own = [*with_env_kwargs(model, arguments), "--output-folder", str(part)]
+                record_video(model, [*own, "--no-render"])  # else it draws twice
             parts.append(next(part.glob("*.mp4")))
         titles = [" ".join(model.prefix.split("-")[:2]) for model in models] if len(models) > 1 else []
         shutil.copy(Path(mpl.get_data_path(), "fonts", "ttf", FONT), folder)
         with replacing(output) as beside:
             _write(parts, titles, beside.resolve(), output.suffix, folder)
+
+
+def with_env_kwargs(model: FoundModel, arguments: Sequence[str]) -> list[str]:
+    """
+    Arguments of `record_video` with those of the environment that the run's settings have, which it does not read itself.
+
+    :param model: of the run
+    :param arguments: the user's, whose own `--env-kwargs` count where both have one
+    """
+    (settings,) = (path.parent for path in Path(model.run).glob("*/config.yml"))
+    words = [f"{name}:{value!r}" for name, value in (read_run(settings).get("env_kwargs") or {}).items()]
+    given = list(arguments)
+    if words and "--env-kwargs" not in given:
+        return [*given, "--env-kwargs", *words]
+    place = given.index("--env-kwargs") + 1 if words else 0
+    return [*given[:place], *words, *given[place:]]
 
 
 def _write(parts: Sequence[Path], titles: Sequence[str], output: Path, ending: str, folder: str) -> None:

@@ -142,6 +142,7 @@ def test_rows_come_before_during_and_after_training_and_at_the_end_on_other_stat
     tmp_path, row, cheetah_buffer, capsys
 ):
     file = tmp_path / "rows.jsonl"
+    file.write_text('{"of an attempt": "that was killed before its first checkpoint"}\n')
     model = make_model(cheetah_buffer)
     model.learn(7, EvaluationCallback(str(file), row, eval_freq=3, n_episodes=2, n_final_episodes=4, n_envs=2))
     rows = read_rows(file)

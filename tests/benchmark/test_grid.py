@@ -114,7 +114,9 @@ def test_a_killed_grid_takes_its_cell_along_goes_on_and_repeats_nothing(grid, wo
     assert main(["report", "results", "-o", "docs"]) == 0
     assert f"| {TASK} | 50% | *not run*" not in (workplace / "docs" / "report.md").read_text()
     assert main([*grid, "-n", "8"]) == 2
-    assert "results has it with 6 gradient steps, 8 are asked for" in capfd.readouterr().err
+    assert "results has it with n_timesteps 6 instead of 8" in capfd.readouterr().err
+    assert main([*grid, "--final-episodes", "2", "--target-return", "7"]) == 2
+    assert "has it with --final-episodes 3 instead of 2, env_wrapper " in capfd.readouterr().err
 
 
 STUB = """
@@ -124,7 +126,7 @@ import json, pathlib, sys, time, yaml
 print("step 3 of 6: training", flush=True)
 if arguments["row"]["algo"] == "dtfm":
     {instead}
-evaluation = dict(step=6, final=True, returns=[1.0], lengths=[2], successes=None, solver=None, n_solver_steps=None)
+evaluation = dict(step=6, final=True, returns=[1.0] * 3, lengths=[2] * 3, successes=None, solver=None, n_solver_steps=None)
 rest = dict(wall_s=1.0, steps_per_s=6.0, commit=None, versions={{}}, hardware={{}})
 pathlib.Path(arguments["rows"]).write_text(json.dumps({{**arguments["row"], **evaluation, **rest}}) + chr(10))
 """

@@ -11,6 +11,8 @@ from sb3_dtfm.benchmark.report.figures import X_AXES, plot_group
 from sb3_dtfm.benchmark.report.runs import (
     OVER_EPISODES,
     OVER_SEEDS,
+    Run,
+    final_interval,
     group_runs,
     learning_curve,
     paired_scores,
@@ -20,6 +22,7 @@ from sb3_dtfm.benchmark.report.runs import (
 )
 from sb3_dtfm.benchmark.rows import Cell
 from sb3_dtfm.cli.main import main
+from tests.benchmark.conftest import make_row
 
 ROWS = Path(__file__).parent / "rows"
 LIFT, CHEETAH = "robosuite/Lift-v0", "HalfCheetah-v5"
@@ -150,6 +153,18 @@ def test_minutes_to_the_threshold_are_those_of_the_first_evaluation_there(groups
         assert returns._replace(final={**returns.final, "data": recorded}).minutes_to_threshold is None
 
 
+def test_the_interval_of_success_is_the_wider_one_of_seeds_and_episodes():
+    def run(seed: int, n_successes: int) -> Run:
+        successes = [i < n_successes for i in range(10)]
+        row = make_row(seed=seed, returns=[0.0] * 10, lengths=[1] * 10, successes=successes)
+        return Run(Cell.of(row), [], row)
+
+    apart, alike = ([run(seed, n) for seed, n in enumerate(each)] for each in ((2, 9), (5, 5)))
+    assert final_interval(apart) == pytest.approx((55.0, 0.0, 100.0))  # Student's t: 55 +- 445
+    wilsons = (50.0, 29.93, 70.07)  # of 10 in 20
+    assert final_interval(alike) == pytest.approx(wilsons, abs=0.01)
+
+
 def test_steps_to_success_are_those_of_all_seeds_and_failures_take_for_ever(groups):
     run = groups["small"].of(LIFT, 1.0, "dt")[0]
     other = run._replace(final={**run.final, "lengths": [30, 50], "successes": [True, True]})
@@ -221,7 +236,7 @@ def test_a_label_of_another_commit_says_so_in_its_table(tmp_path):
     (tmp_path / "again.jsonl").write_text("\n".join(again) + "\n")
     assert main(["report", str(ROWS), str(tmp_path / "again.jsonl"), "-o", str(tmp_path)]) == 0
     (row,) = table_row((tmp_path / "report.md").read_text(), "ema")
-    assert row[-3:] == ["0123456, fedcba9-dirty", "0123456", "2"]
+    assert row[-3:] == ["0123456, fedcba9-dirty", "0123456", "2; 1 without"]
 
 
 def test_a_folder_for_each_study_makes_a_part_for_each(tmp_path):

@@ -16,6 +16,16 @@ def test_a_row_comes_back_as_it_was_written(tmp_path, row):
     assert read_rows(tmp_path / "a.jsonl") == [row, other, timed]
 
 
+def test_what_a_kill_has_left_of_a_last_line_is_left_out_where_that_is_known(tmp_path, row):
+    for _ in range(2):
+        write_row(tmp_path / "a.jsonl", row)
+    whole = (tmp_path / "a.jsonl").read_text()
+    (tmp_path / "a.jsonl").write_text(whole[:-20])
+    assert read_rows(tmp_path / "a.jsonl", torn_end=True) == [row]
+    with pytest.raises(RowError, match="line 2: is not JSON"):
+        read_rows(tmp_path / "a.jsonl")
+
+
 def test_files_of_several_machines_merge_by_concatenation(tmp_path):
     rows = [make_row(seed=seed) for seed in range(3)]
     write_row(tmp_path / "a.jsonl", rows[0])

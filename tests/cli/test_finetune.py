@@ -11,7 +11,7 @@ from sb3_dtfm import DTFM
 from sb3_dtfm.cli.main import main
 from sb3_dtfm.data import load_dataset
 from sb3_dtfm.finetuning import OnlineDTFM, SteeredDTFM
-from sb3_dtfm.zoo.finetuning import asking_for
+from sb3_dtfm.zoo.arguments import asking_for
 from tests.recorded import DATASET_ID, tiny_training
 
 EVALUATIONS = ["--eval-freq", "10", "--eval-episodes", "2"]

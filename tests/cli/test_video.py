@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from collections import OrderedDict
 from pathlib import Path
 
 import gymnasium as gym
@@ -17,6 +18,8 @@ from sb3_dtfm.cli.main import main
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.envs import ReturnToGoWrapper
 from sb3_dtfm.zoo import rendering
+from sb3_dtfm.zoo.commands import FoundModel
+from sb3_dtfm.zoo.video import with_env_kwargs
 from tests.conftest import TINY_FLOW_POLICY
 from tests.recorded import DATASET_ID, tiny_training
 
@@ -61,6 +64,15 @@ def test_a_gif_of_a_training_shows_all_its_models_with_their_names(trained):
     title = [picture[:32] for picture in (pictures[0], pictures[-1])]
     assert all(part.max() > 200 for part in title), "white letters"
     assert not np.array_equal(*title)
+
+
+def test_the_environment_is_that_of_the_runs_settings(tmp_path):
+    (tmp_path / "Pendulum-v1").mkdir()
+    for name, values in {"config.yml": {"env_kwargs": {"g": 5.0}}, "args.yml": {}}.items():
+        (tmp_path / "Pendulum-v1" / name).write_text(yaml.dump(OrderedDict(values)))
+    model = FoundModel("final-model", "model.zip", str(tmp_path))
+    assert with_env_kwargs(model, ["-n", "3"]) == ["-n", "3", "--env-kwargs", "g:5.0"]
+    assert with_env_kwargs(model, ["--env-kwargs", "g:1.0"]) == ["--env-kwargs", "g:5.0", "g:1.0"], "the last one counts"
 
 
 def test_agents_of_rl_zoo_are_filmed_too(workplace):

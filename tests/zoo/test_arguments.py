@@ -1,11 +1,13 @@
 """What the command line makes of its arguments before RL-Zoo sees them."""
 
 import argparse
+import ast
 
+import numpy as np
 import pytest
 from rl_zoo3.utils import StoreDict
 
-from sb3_dtfm import DTFM
+from sb3_dtfm import DT, DTFM
 from sb3_dtfm.cli.main import main
 from sb3_dtfm.zoo.arguments import UsageError, enjoy_arguments, train_arguments
 from sb3_dtfm.zoo.registration import packaged_config, with_policy_options
@@ -117,3 +119,48 @@ def test_a_run_has_the_options_of_its_policy_and_the_settings_files_others(workp
     assert "critic_steps" in (workplace / "logs/dtfm/HalfCheetah-v5_1/HalfCheetah-v5/config.yml").read_text()
     assert main([*command, "flow_layers:1"]) == 2
     assert "flow_layers" in capsys.readouterr().err
+
+
+def test_another_target_leaves_the_yaml_files_other_wrappers(tmp_path):
+    wrappers = "[{gymnasium.wrappers.TransformReward: {func: abs}}, {sb3_dtfm.envs.ReturnToGoWrapper: {target_return: 5}}]"
+    for name in ("HalfCheetah-v5", "default"):
+        (tmp_path / "mine.yml").write_text(f"{name}: {{env_wrapper: {wrappers}}}\n")
+        given = [
+            "--algo",
+            "dt",
+            "--env",
+            "HalfCheetah-v5",
+            "--conf-file",
+            str(tmp_path / "mine.yml"),
+            "--target-return",
+            "3",
+        ]
+        *_, wanted = train_arguments(given)
+        name, _, value = wanted.partition(":")
+        assert name == "env_wrapper"
+        assert ast.literal_eval(value) == [
+            {"gymnasium.wrappers.TransformReward": {"func": "abs"}},
+            {"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 3.0}},
+        ]
+
+
+def test_evaluations_count_gradient_steps_whatever_n_envs_is(workplace):
+    command = tiny_training("dt", "--dataset", DATASET_ID, "-n", "8", "--eval-freq", "4", "--eval-episodes", "1")
+    assert main([*command, "--save-freq", "4", "-params", "n_envs:2"]) == 0
+    run = workplace / "logs/dt/HalfCheetah-v5_1"
+    assert np.load(run / "evaluations.npz")["timesteps"].tolist() == [0, 4, 8]
+    assert sorted(path.name for path in run.glob("rl_model*")) == ["rl_model_4_steps.zip", "rl_model_8_steps.zip"]
+
+
+def test_a_trial_that_diverges_does_not_end_a_search(workplace, monkeypatch, capfd):
+    learn, fail = DT.learn, iter([True])
+
+    def diverge(self, *args, **kwargs):
+        if next(fail, False):
+            raise FloatingPointError("on purpose")
+        return learn(self, *args, **kwargs)
+
+    monkeypatch.setattr(DT, "learn", diverge)
+    search = ["-n", "2", "-optimize", "--n-trials", "2", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots"]
+    assert main(tiny_training("dt", "--dataset", DATASET_ID, *search)) == 0
+    assert "Number of finished trials:  2" in capfd.readouterr().out

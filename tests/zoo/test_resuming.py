@@ -150,6 +150,25 @@ def test_a_run_without_a_seed_goes_on_with_the_one_that_was_drawn(workplace):
     assert (model.seed, model.num_timesteps) == (seed, N_STEPS)
 
 
+def test_other_arguments_beside_resume_neither_start_nor_delete_anything(workplace, capsys):
+    assert main(training((SIGNAL_AT, signal.SIGINT))) == 0
+    files = sorted(RUN.rglob("*"))
+    assert resume("-P") == 2
+    assert "takes no other arguments; it was started with --algo dtfm --env HalfCheetah-v5" in capsys.readouterr().err
+    assert sorted(RUN.rglob("*")) == files
+
+
+def test_what_an_agent_knew_is_not_lost_with_a_run_that_was_killed_early(workplace):
+    assert main(training()) == 0
+    agent = RUN / "HalfCheetah-v5.zip"
+    assert main([*training((SIGNAL_AT, signal.SIGINT)), "-i", str(agent)]) == 0
+    second = RUN.with_name("HalfCheetah-v5_2")
+    (second / CHECKPOINT).unlink()  # as if it had been killed before there was one
+    assert main(["train", "--resume", str(second)]) == 0
+    model = DTFM.load(second / "HalfCheetah-v5.zip")  # which the same signal has interrupted again
+    assert (model.num_timesteps, model._n_updates) == (SIGNAL_AT + 1, N_STEPS + SIGNAL_AT + 1)
+
+
 @pytest.mark.parametrize(
     ("run", "message"),
     [

@@ -238,10 +238,18 @@ def spread(runs: Sequence[Run], measure: str) -> tuple[float, float] | None:
 
 
 def final_interval(runs: Sequence[Run]) -> Interval:
-    """Final evaluation: success in percent with Wilson's interval of all episodes, or return with Student's over runs."""
-    if all(run.counts_success for run in runs):
-        return _pooled_success([run.final for run in runs])
-    return student_t([row_value(run.final) for run in runs])
+    """
+    Final evaluation: return with Student's interval over runs; success in percent with the wider of that and Wilson's of all
+    episodes, which tells more where runs are alike, or there is one.
+    """
+    over_runs = student_t([row_value(run.final) for run in runs])
+    if not all(run.counts_success for run in runs):
+        return over_runs
+    over_episodes = _pooled_success([run.final for run in runs])
+    low, high = np.clip(over_runs[1:], 0.0, 100.0).tolist()
+    return (
+        over_episodes if not high - low > over_episodes.high - over_episodes.low else Interval(over_runs.estimate, low, high)
+    )
 
 
 def late_interval(runs: Sequence[Run]) -> Interval | None:

@@ -150,8 +150,8 @@ def _digits(value: float) -> int:
 
 def _intervals(group: Group) -> list[str]:
     text = (
-        "95 % intervals. Late average: Student's t over seeds. Final evaluation: Wilson's over the episodes of all seeds "
-        "for success, Student's t over seeds for returns."
+        "95 % intervals. Late average: Student's t over seeds. Final evaluation: likewise; of success the wider one "
+        "of that and Wilson's over the episodes of all seeds."
     )
     columns = {MEASURES["late"]: _late, MEASURES["final"]: _final}
     return [text, "", *_cell_table(group, group.tasks, columns)]
@@ -299,7 +299,8 @@ def _changes(base: Group, labelled: Sequence[Group]) -> list[str]:
         for task, regime, algo, runs, same in compared_cells(base, group):
             settings = _escape(changed_settings(runs[0], base.of(task, regime, algo)))
             cells = [say(each) if each else NOT_RUN for say in columns.values() for each in (runs, same)]
-            rows.append([group.label, settings or NONE, task, f"{regime:.0%}", algo.upper(), *cells, str(len(runs))])
+            seeds = f"{len(runs)}; {len(same)} without" if same and len(same) != len(runs) else str(len(runs))
+            rows.append([group.label, settings or NONE, task, f"{regime:.0%}", algo.upper(), *cells, seeds])
     text = (
         "What a label's settings did, beside the runs without it of the same seeds: mean ± standard deviation over seeds, "
         "success in percent or mean return; minutes of training without evaluations; commits of the code that trained them. "
