@@ -14,8 +14,8 @@ if TYPE_CHECKING:
         ReturnToGoWrapper,
         check_vec_env,
         flatten_observation_space,
+        known_task,
         return_to_go_space,
-        time_limit,
     )
 
 register_robosuite_envs()
@@ -28,10 +28,10 @@ __all__ = [
     "ReturnToGoWrapper",
     "check_vec_env",
     "flatten_observation_space",
+    "known_task",
     "register_gymnasium_robotics",
     "register_robosuite_envs",
     "return_to_go_space",
-    "time_limit",
 ]
 
 

@@ -1,7 +1,7 @@
 """The wrapper that shows a sequence policy its target return and its time step, and the spaces that come with it."""
 
 import math
-from typing import Any, SupportsFloat
+from typing import Any, NamedTuple, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
@@ -91,6 +91,18 @@ def check_target_return(target_return: float) -> float:
     return value
 
 
+class Task(NamedTuple):
+    """
+    A registered task.
+
+    :param env_id: Gymnasium id
+    :param max_episode_steps: after which Gymnasium ends an episode; None where it does not
+    """
+
+    env_id: str
+    max_episode_steps: int | None
+
+
 class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """
     Adds to each observation the return still to reach and the time step.
@@ -119,6 +131,11 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._sorted_space = sort_observation_space(env.observation_space)
         self._return_to_go = self.target_return
         self._timestep = 0
+
+    @property
+    def known_task(self) -> Task | None:
+        """What Gymnasium knows of it, in words that pass between processes, where the whole `spec` may not."""
+        return None if self.spec is None else Task(self.spec.id, self.spec.max_episode_steps)
 
     def set_target_return(self, target_return: float) -> None:
         """
@@ -191,10 +208,7 @@ def check_vec_env(env: VecEnv) -> None:
         )
 
 
-def time_limit(env: VecEnv, otherwise: int | None = None) -> int | None:
-    """
-    :param otherwise: where the environment has no `spec` to tell
-    :return: steps after which Gymnasium ends an episode; None where it does not
-    """
-    (spec,) = env.get_attr("spec", indices=0)
-    return otherwise if spec is None else spec.max_episode_steps
+def known_task(env: VecEnv) -> Task | None:
+    """What Gymnasium knows of the task behind a :class:`ReturnToGoWrapper`; None of one that is not registered."""
+    (task,) = env.get_attr("known_task", indices=0)
+    return task

@@ -58,6 +58,13 @@ def bounds_of(space: ActionSpace) -> tuple[np.ndarray, np.ndarray]:
     return np.array(first, space.dtype), np.array(first + int(space.n) - 1, space.dtype)
 
 
+def same_actions(space: ActionSpace, other: ActionSpace) -> bool:
+    """Whether two spaces hold the same actions, of whatever precision."""
+    return space.shape == other.shape and all(
+        np.allclose(bound, bound_of_other) for bound, bound_of_other in zip(bounds_of(space), bounds_of(other), strict=True)
+    )
+
+
 def choices_between(first: Any, last: Any) -> spaces.Discrete:
     """
     The Discrete space of a range.

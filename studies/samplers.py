@@ -18,7 +18,7 @@ from tqdm import tqdm
 from sb3_dtfm import DTFM
 from sb3_dtfm.benchmark.evaluation import evaluate, make_seeded_envs
 from sb3_dtfm.benchmark.report.statistics import wilson
-from sb3_dtfm.benchmark.settings import WRAPPER
+from sb3_dtfm.zoo.arguments import WRAPPER
 
 # Name: solver, its steps, keys and values kept.
 WAYS = {

@@ -8,7 +8,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -16,7 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule, TensorDict
 from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_dtfm.actions import ActionSpace, bounds_of
+from sb3_dtfm.actions import ActionSpace, same_actions
 from sb3_dtfm.algorithms.loading import check_sizes, from_file, parameters
 from sb3_dtfm.algorithms.saving import OPTIMIZER, POLICY, UnsavedSchedule, optimizer_tensors, optimizers, to_configuration
 from sb3_dtfm.arguments import (
@@ -32,7 +31,7 @@ from sb3_dtfm.arguments import (
 )
 from sb3_dtfm.data import Dataset, DatasetError, ScoreReference, TrajectoryBuffer, check_action_space, load_dataset
 from sb3_dtfm.distributed import check_batch_size, first_of_each_machine_first, is_first_process
-from sb3_dtfm.envs import check_vec_env, return_to_go_space, time_limit
+from sb3_dtfm.envs import check_vec_env, known_task, return_to_go_space
 from sb3_dtfm.files import ModelFile, file_name, holds_pickles, read_model, write_model, write_onnx
 from sb3_dtfm.optimization import LEARNING_RATE_SCHEDULES, PRECISIONS, RunningMeans
 from sb3_dtfm.policies import SequencePolicy
@@ -214,8 +213,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
                 f"{name} has no dataset to learn from: give one to the constructor, or to a loaded model by "
                 f"{name}.load(path, dataset=...) or model.set_dataset(...)."
             )
-        if self.env is not None:
-            self.time_limit = time_limit(self.env, self.time_limit)
+        if self.env is not None and (task := known_task(self.env)) is not None:
+            self.time_limit = task.max_episode_steps
         known = {"action_space": getattr(self, "action_space", None), "max_episode_steps": self.time_limit}
         with first_of_each_machine_first():
             buffer = load_dataset(self.dataset, **{**known, **(self.dataset_kwargs or {})})
@@ -229,7 +228,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         if self.return_steps is not None:
             if self.verbose >= 1 and is_first_process():
                 print(f"Learning which returns may be expected (return_steps={self.return_steps})", flush=True)
-            buffer = buffer.with_expected_returns(self.return_steps, self.dataset_seed)
+            buffer = buffer.to("cpu").with_expected_returns(self.return_steps, self.dataset_seed)
         self.buffer = buffer.to(self.device)
         return self.buffer
 
@@ -242,11 +241,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         ours, theirs = self.observation_space["observation"], observation_space["observation"]  # type: ignore[index]
         if ours.shape != theirs.shape:
             raise DatasetError(f"{found} observations of {theirs}, {expected} {ours}.")
-        same_bounds = self.action_space.shape == action_space.shape and all(
-            np.allclose(bound, other)
-            for bound, other in zip(bounds_of(self.action_space), bounds_of(action_space), strict=True)
-        )
-        if not same_bounds:
+        if not same_actions(self.action_space, action_space):
             raise DatasetError(f"{found} actions of {action_space}, {expected} {self.action_space}.")
 
     @staticmethod
@@ -254,9 +249,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         """
         :raises DatasetError: the data were recorded in another environment
         """
-        (spec,) = env.get_attr("spec", indices=0)
-        if spec is not None:
-            buffer.check_task(spec.id)
+        if (task := known_task(env)) is not None:
+            buffer.check_task(task.env_id)
 
     def _setup_model(self) -> None:
         self._check_arguments(learning_rate=NOT_NEGATIVE)
@@ -424,9 +418,9 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         if not is_first_process():
             return
         if self.env is not None:
-            spec, asked = (self.env.get_attr(name, indices=0)[0] for name in ("spec", "target_return"))
-            env_id = env_id or (spec.id if spec is not None else None)
-            target_return = asked if target_return is None else target_return
+            task = known_task(self.env)
+            env_id = env_id or (task.env_id if task is not None else None)
+            target_return = self.env.get_attr("target_return", indices=0)[0] if target_return is None else target_return
         if env_id is None and self.buffer is not None:
             env_id = self.buffer.env_id
         exported = ExportedPolicy(self.policy)

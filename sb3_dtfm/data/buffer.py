@@ -11,7 +11,8 @@ import torch as th
 from gymnasium import spaces
 from gymnasium.envs.registration import parse_env_id
 
-from sb3_dtfm.actions import ActionSpace, bounds_of, from_vectors
+from sb3_dtfm.actions import ActionSpace, bounds_of, from_vectors, same_actions
+from sb3_dtfm.arguments import COUNT, check_arguments
 from sb3_dtfm.data.collecting import collect
 from sb3_dtfm.data.drawing import FlatSteps
 from sb3_dtfm.data.episodes import EpisodeTable, Statistics, moments
@@ -191,8 +192,7 @@ class TrajectoryBuffer(FlatSteps):
         :return: on the same flat tensors, but for the returns-to-go; the buffer itself where no episode is longer
         :raises ValueError: `max_episode_steps` below 1
         """
-        if max_episode_steps < 1:
-            raise ValueError(f"max_episode_steps must be at least 1, got {max_episode_steps}.")
+        check_arguments({"max_episode_steps": max_episode_steps}, {"max_episode_steps": COUNT})
         longer = np.flatnonzero(self.episode_lengths > max_episode_steps)
         if not len(longer):
             return self
@@ -306,7 +306,7 @@ class TrajectoryBuffer(FlatSteps):
         first, source = buffers[0], " + ".join(buffer.source for buffer in buffers)
         for other in buffers[1:]:
             sizes = other.observation_space.shape == first.observation_space.shape
-            if not sizes or other.action_space != first.action_space:
+            if not sizes or not same_actions(other.action_space, first.action_space):
                 held = [
                     f"{each.source} holds {each.observation_space.shape}, {each.action_space}" for each in (first, other)
                 ]
@@ -324,6 +324,8 @@ class TrajectoryBuffer(FlatSteps):
         joined = cls(tensors, table, first.observation_space, first.action_space, source, env_id=named.env_id)
         if len({buffer.score_reference for buffer in buffers}) == 1:
             joined.score_reference = first.score_reference
+        if dropped := [buffer.dropped for buffer in buffers if buffer.dropped]:
+            joined.dropped = sum(n for n, _ in dropped), dropped[0][1]
         joined.weights = np.concatenate([w * each.weights for w, each in zip(weights, buffers, strict=True)])
         return joined
 

@@ -25,7 +25,7 @@ from sb3_dtfm.data.storage import STEP_ARRAYS, WRITE_BUFFER, FileStorage, Mapped
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference
 
 # Counts up whenever what is stored, or what the readers make of a dataset, changes: older caches are then built anew.
-FORMAT = 4
+FORMAT = 5
 DESCRIPTION = "cache.json"
 EPISODES = "episodes.npz"
 SPACES = ("observation_space", "action_space")
@@ -48,6 +48,18 @@ def existing_file(path: str | os.PathLike[str], expected: str) -> Path:
         problem = "is a folder" if path.is_dir() else "does not exist"
         raise DatasetError(f"{path.absolute()} {problem}; {expected} is expected.")
     return path
+
+
+def files_below(folder: Path) -> list[Path]:
+    """All files in a folder and below it, behind linked folders, too, sorted."""
+    files, seen = [], set()
+    for parent, folders, names in os.walk(folder, followlinks=True):
+        if (real := os.path.realpath(parent)) in seen:  # a link leads back
+            folders.clear()
+            continue
+        seen.add(real)
+        files += [Path(parent, name) for name in names]
+    return sorted(file for file in files if file.is_file())
 
 
 class Fingerprint(NamedTuple):
@@ -75,7 +87,7 @@ class Fingerprint(NamedTuple):
         :param arguments: of the reader, as JSON can hold them
         """
         path = path.resolve()
-        files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+        files = [path] if path.is_file() else files_below(path)
         state = [(str(file.relative_to(path)), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
         return cls(name, str(path), json.dumps(arguments, sort_keys=True), _digest(state))
 

@@ -76,10 +76,11 @@ def json_options(options: dict[str, Any]) -> dict[str, Any]:
     """
     options = dict(options)
     space = options.pop("action_space", None)
-    if options.get("action_bounds") is None and space is not None:
-        options["action_bounds"] = bounds_of(space)
-    if options.get("action_bounds") is not None:
-        options["action_bounds"] = [np.asarray(bound).tolist() for bound in options["action_bounds"]]
+    if space is not None:  # which counts less than a file's own bounds, and these less than those that are given
+        options["environment_bounds"] = bounds_of(space)
+    for name in ("action_bounds", "environment_bounds"):
+        if options.get(name) is not None:
+            options[name] = [np.asarray(bound).tolist() for bound in options[name]]
     return options
 
 
@@ -322,7 +323,7 @@ def _successes(arrays: _Arrays, n_steps: int, stops: np.ndarray) -> np.ndarray:
     """(E,): 1, 0, or NaN of an episode of which nothing tells."""
     if not arrays.has(SUCCESSES):
         return np.full(len(stops), np.nan)
-    array, where = arrays.read(SUCCESSES), f"{arrays.source}: {arrays.name(SUCCESSES)}"
+    array, where = np.atleast_1d(arrays.read(SUCCESSES)), f"{arrays.source}: {arrays.name(SUCCESSES)}"
     if len(array) != len(stops):
         return check_flags(array, n_steps, where)[stops - 1].astype(float)
     silent = np.isnan(array) if array.dtype.kind == "f" else np.zeros(array.shape, bool)

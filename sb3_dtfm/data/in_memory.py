@@ -184,6 +184,24 @@ def is_replay_buffer(dataset: Any) -> bool:
     return isinstance(dataset, ReplayBuffer)
 
 
+def _breaks(replay_buffer: ReplayBuffer, order: np.ndarray) -> np.ndarray:
+    """
+    Where another step follows than the next one: a second `learn()` begins with a reset, which no flag tells of.
+
+    :param order: (T,) of the buffer's rows
+    :return: (T - 1, environments) bool
+    """
+    breaks = np.zeros((max(0, len(order) - 1), replay_buffer.n_envs), bool)
+    if replay_buffer.optimize_memory_usage:  # one array holds both, and SB3 marks such a step itself
+        return breaks
+    before: Any = replay_buffer.observations
+    after: Any = replay_buffer.next_observations
+    for key in before if isinstance(before, dict) else (...,):
+        came, seen = after[key][order[:-1]], before[key][order[1:]]
+        breaks |= (came != seen).any(axis=tuple(range(2, seen.ndim)))
+    return breaks
+
+
 def load_replay_buffer(
     replay_buffer: ReplayBuffer, on_invalid: str = "raise", storage: FileStorage | None = None
 ) -> TrajectoryBuffer:
@@ -192,7 +210,8 @@ def load_replay_buffer(
 
     SB3's algorithms store actions of a Box scaled to [-1, 1]; they are brought back into the buffer's action space.
     Observations and rewards are there as the environment gave them, `VecNormalize` or not. An episode at whose end
-    `TimeLimit.truncated` was said is truncated. The last one of each environment stops where the buffer does; of a full
+    `TimeLimit.truncated` was said is truncated. One that a second `learn()` has cut off just stops, as the last one of each
+    environment does where the buffer ends; of a full
     buffer, the first one of each environment is left out, since its beginning has been written over.
 
     :param replay_buffer: of any number of environments
@@ -210,12 +229,12 @@ def load_replay_buffer(
     space = check_action_space(replay_buffer.action_space, source)
     n_steps = replay_buffer.size()
     order = (np.arange(n_steps) + (replay_buffer.pos if replay_buffer.full else 0)) % max(1, replay_buffer.buffer_size)
-    dones = replay_buffer.dones[order] > 0
-    if n_steps:
-        dones[-1] = True  # so far
+    ends = replay_buffer.dones[order] > 0
+    ends[:-1] |= _breaks(replay_buffer, order)
+    ends[-1:] = True  # so far
     pieces = []
     for env in range(replay_buffer.n_envs):
-        stops = np.flatnonzero(dones[:, env]) + 1
+        stops = np.flatnonzero(ends[:, env]) + 1
         starts = np.concatenate(([0], stops[:-1])) if len(stops) else stops
         pieces += [(env, *piece) for piece in zip(starts, stops, strict=True)][int(replay_buffer.full) :]
     if not pieces:

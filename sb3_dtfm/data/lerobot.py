@@ -11,7 +11,7 @@ import numpy as np
 from sb3_dtfm.actions import ActionSpace
 from sb3_dtfm.data.arrow import import_pyarrow
 from sb3_dtfm.data.buffer import TrajectoryBuffer
-from sb3_dtfm.data.cache import Fingerprint
+from sb3_dtfm.data.cache import Fingerprint, files_below
 from sb3_dtfm.data.flat import bounded_space, fitted, json_options
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_real, check_size, naming
@@ -140,7 +140,7 @@ def _read(folder: Path, names: Sequence[str], n_frames: int, source: str) -> tup
     :param names: of the columns
     :param n_frames: N, as the dataset tells
     """
-    paths = sorted((folder / DATA).rglob("*.parquet"))
+    paths = [path for path in files_below(folder / DATA) if path.suffix == ".parquet"]
     if not paths:
         raise DatasetError(f"{source}: there is no parquet file below {DATA}.")
     pyarrow = import_pyarrow(source)

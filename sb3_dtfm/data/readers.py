@@ -2,7 +2,6 @@
 
 import copy
 import inspect
-import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ from minari import MinariDataset
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_dtfm.actions import ActionSpace
-from sb3_dtfm.arguments import with_nearest
+from sb3_dtfm.arguments import POSITIVE, with_nearest
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, load_cached
 from sb3_dtfm.data.flat import fingerprint_flat_file, is_flat_file, is_mapping, load_flat
@@ -57,23 +56,31 @@ def _is_one_of_several(dataset: Any) -> bool:
     return isinstance(dataset, str | os.PathLike | MinariDataset | ReplayBuffer | TrajectoryBuffer)
 
 
-def load_several(datasets: Sequence[Any], action_space: ActionSpace | None = None) -> TrajectoryBuffer:
+def load_several(
+    datasets: Sequence[Any],
+    action_space: ActionSpace | None = None,
+    env_id: str | None = None,
+    max_episode_steps: int | None = None,
+) -> TrajectoryBuffer:
     """
     Several datasets of one task as one, in memory.
 
     :param datasets: anything that :func:`load_dataset` takes, or `{"dataset": it, "weight": 2.0, ...}` with its other
         arguments; a step of one of weight 2 is learned from twice as often as one of weight 1
-    :param action_space: see :func:`load_dataset`
+    :param action_space: see :func:`load_dataset`, as of the others, which count for each that has none of its own
+    :param env_id:
+    :param max_episode_steps:
     :raises DatasetError: one of them cannot be read, or is of another task; a weight that is no positive number
     """
     buffers, weights = [], []
     for each in datasets:
         options = dict(each) if is_mapping(each) else {"dataset": each}
         dataset, weight = options.pop("dataset"), options.pop("weight", 1.0)
-        if not isinstance(weight, int | float) or not 0.0 < weight < math.inf:
+        if not POSITIVE.accepts(weight):
             raise DatasetError(f"dataset {dataset!s}: weight is {weight!r}; a positive number is accepted.")
-        buffers.append(load_dataset(dataset, **{"action_space": action_space, **options}))
-        weights.append(weight)
+        shared = {"action_space": action_space, "env_id": env_id, "max_episode_steps": max_episode_steps}
+        buffers.append(load_dataset(dataset, **{**shared, **options}))
+        weights.append(float(weight))
     return TrajectoryBuffer.join(buffers, weights)
 
 
@@ -126,7 +133,8 @@ def load_dataset(
     :raises TypeError: the reader has no such option
     """
     reader = _find_reader(dataset)
-    own = [name for name in inspect.signature(reader.load).parameters if name not in ("storage", "action_space")][1:]
+    parameters = inspect.signature(reader.load).parameters
+    own = [name for name in parameters if name not in ("storage", *COMMON_OPTIONS)][1:]
     given = kwargs if cache_dir is None else {**kwargs, "cache_dir": cache_dir}
     accepted = [*own, *(["cache_dir"] if reader.fingerprint else []), *COMMON_OPTIONS]
     unknown = sorted(set(given) - set(accepted))
@@ -135,8 +143,8 @@ def load_dataset(
         raise TypeError(
             f"dataset {name}: unknown option {with_nearest(unknown, accepted)}; accepted: {', '.join(accepted)}."
         )
-    if "action_space" in inspect.signature(reader.load).parameters:
-        kwargs["action_space"] = action_space
+    common = {"action_space": action_space, "env_id": env_id, "max_episode_steps": max_episode_steps}
+    kwargs.update((name, value) for name, value in common.items() if name in parameters)
     if cache_dir is None or reader.fingerprint is None:
         buffer = reader.load(dataset, **kwargs)
     else:

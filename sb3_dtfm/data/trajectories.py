@@ -17,8 +17,8 @@ MOST_CHOICES = 2**16
 # The kinds of NumPy's types that are real numbers: float, int, unsigned, bool.
 REAL = "fiub"
 # An array may take this many times the bytes that are stored of it, and this many bytes more: far less than a file of
-# some kilobytes can claim, and more than compression makes of any recording.
-LARGEST_EXPANSION, SMALL_ARRAY = 100, 2**24
+# some kilobytes can claim, and more than compression makes of any recording: deflate packs at most 1,032 bytes into one.
+LARGEST_EXPANSION, SMALL_ARRAY = 1100, 2**24
 # Numbers whose squares sum to less than this are all finite in float32; above, each has to be looked at.
 SURELY_FINITE = 1e37
 

@@ -206,7 +206,6 @@ class OnlineDTFM(DTFM):
         known = (self.action_space, self.buffer.observation_space)
         new = TrajectoryBuffer.from_trajectories(episodes, *known, source="own episodes", env_id=self.buffer.env_id)
         if self.own is not None:
-            self.own.action_space = self.action_space  # a file's is of single precision, as its bounds
             new = TrajectoryBuffer.join([self.own, new], [1.0, 1.0])
         self.own = new.to(self.device)
 

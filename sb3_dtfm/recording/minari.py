@@ -76,6 +76,8 @@ def write_minari(
             target.rename(staging / OLD)
         (staging / "new").rename(target)
     finally:
+        if (staging / OLD).exists() and not target.exists():
+            (staging / OLD).rename(target)
         shutil.rmtree(staging, ignore_errors=True)
     return minari.MinariDataset(target / "data")
 

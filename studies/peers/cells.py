@@ -16,7 +16,7 @@ from sb3_dtfm.benchmark.evaluation import FINAL_STATES, evaluate, make_seeded_en
 from sb3_dtfm.benchmark.rows import Cell, Row, read_rows
 from sb3_dtfm.benchmark.settings import Task, read_yaml, task_settings
 from sb3_dtfm.data import TrajectoryBuffer, load_dataset
-from sb3_dtfm.envs import time_limit
+from sb3_dtfm.envs import known_task
 from sb3_dtfm.zoo.arguments import UsageError
 
 HERE = Path(__file__).parent
@@ -217,7 +217,7 @@ def run_peer(
         tempfile.TemporaryDirectory() as folder,
     ):
         path = Path(folder) / "episodes.npz"
-        export(data, peer, path, time_limit(vec_env))
+        export(data, peer, path, task.max_episode_steps if (task := known_task(vec_env)) else None)
         training = process.train(
             path, peer.settings_for(data), seed, *budget, lambda done, n_steps: say(done, n_steps, "training")
         )

@@ -22,7 +22,7 @@ from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
 
 from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer, cache, load_dataset
-from sb3_dtfm.data.cache import FORMAT, Fingerprint, load_cached
+from sb3_dtfm.data.cache import FORMAT, Fingerprint, files_below, load_cached
 from sb3_dtfm.data.storage import CAN_ADVISE, STEP_ARRAYS, FileStorage, step_file
 from tests.data.small import ACTION_SPACE, OBSERVATION_SPACE, make_buffer, make_trajectory
 
@@ -403,3 +403,24 @@ def test_a_buffer_has_no_cache(tmp_path: Path):
         TypeError, match=r"TrajectoryBuffer\(trajectories: 1 episodes, 2 steps\): unknown option cache_dir; accepted: env_id"
     ):
         load_dataset(make_buffer([2]), cache_dir=tmp_path)
+
+
+def test_bounds_that_are_given_and_the_environments_have_caches_of_their_own(tmp_path: Path):
+    """The environment's count less than the file's, those that are given more."""
+    make_buffer([3, 4]).save(tmp_path / "a.npz")
+    wide = spaces.Box(-9.0, 9.0, make_buffer([3]).action_space.shape)
+    cached = dict(cache_dir=tmp_path / "caches")
+    assert load_dataset(tmp_path / "a.npz", action_space=wide, **cached).action_space.high.max() < 9.0
+    assert load_dataset(tmp_path / "a.npz", action_bounds=(wide.low, wide.high), **cached).action_space.high.min() == 9.0
+
+
+def test_files_behind_a_linked_folder_are_known_and_a_circle_is_not_walked_for_ever(tmp_path: Path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "disk" / "a.bin").write_text("1")
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "linked").symlink_to(tmp_path / "disk")
+    (tmp_path / "disk" / "back").symlink_to(tmp_path / "data")
+    assert files_below(tmp_path / "data") == [tmp_path / "data" / "linked" / "a.bin"]
+    before = Fingerprint.of("data", tmp_path / "data", {})
+    (tmp_path / "disk" / "a.bin").write_text("12")
+    assert Fingerprint.of("data", tmp_path / "data", {}).state != before.state

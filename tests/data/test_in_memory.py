@@ -212,6 +212,18 @@ def test_the_replay_buffer_of_an_sb3_model(goal, buffer_size):
     assert np.ptp(actions, axis=0).min() > 1.0  # of ranges 4 and 10: scaled ones would not have been
 
 
+@pytest.mark.parametrize("goal", [False, True])
+def test_a_second_learn_begins_another_episode(goal):
+    """It resets the environment without a word to the buffer: what was going on then just stops."""
+    small = dict(learning_starts=100, buffer_size=50, policy_kwargs={"net_arch": [4]}, device="cpu", seed=0)
+    env = make_vec_env(lambda: TimeLimit(Course(goal), 7))
+    model = DDPG("MultiInputPolicy" if goal else "MlpPolicy", env, train_freq=(1, "step"), **small).learn(6).learn(9)
+    buffer = load_dataset(model.replay_buffer)
+    assert buffer.episode_lengths.tolist() == [4, 2, 4, 5]
+    assert buffer.terminated.tolist() == [True, False, True, False]
+    assert not buffer.truncated.any()
+
+
 def test_a_replay_buffer_without_a_whole_episode():
     empty = ReplayBuffer(10, spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2,)), device="cpu")
     with pytest.raises(DatasetError, match="replay buffer: holds no whole episode in 0 steps of 1 environments"):

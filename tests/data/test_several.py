@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 
 from sb3_dtfm import DT
 from sb3_dtfm.data import DatasetError, load_dataset
@@ -73,8 +74,33 @@ def test_only_data_of_one_task_are_joined():
         load_dataset([{"dataset": arrays(0.0), "env_id": task} for task in ("Hopper-v5", "Ant-v5")])
     same = load_dataset([{"dataset": arrays(0.0), "env_id": "Ant-v5"}, {"dataset": arrays(0.0)}])
     assert same.env_id == "Ant-v5"
+    recorded = [load_dataset(arrays(0.0), env_id=task) for task in ("Hopper-v5", "Ant-v5")]
+    assert load_dataset(recorded, env_id="Ant-v5").env_id == "Ant-v5", "as the refusal recommends"
+    assert load_dataset([{"dataset": arrays(0.0), "weight": np.int64(2)}]).weights.tolist() == [2.0] * 3
     for weight in (0, -1.0, "much", np.inf):
         with pytest.raises(DatasetError, match=r"weight is .*; a positive number is accepted"):
             load_dataset([{"dataset": load_dataset(arrays(0.0)), "weight": weight}])
     with pytest.raises(TypeError, match=r"unknown option best_shade \(did you mean best_share\?\); accepted"):
         load_dataset([{"dataset": arrays(0.0), "best_shade": 1}])
+
+
+def test_precision_is_no_other_range_of_actions(tmp_path):
+    double = load_dataset(arrays(0.0), action_space=spaces.Box(-1.0, 1.0, (2,), np.float64))
+    double.save(tmp_path / "single.npz")
+    assert load_dataset([double, tmp_path / "single.npz"]).n_episodes == 6
+
+
+def test_the_best_of_each_are_chosen_by_what_lies_within_the_time_limit():
+    """Of each first dataset the last episode returns most, behind its third step."""
+    with pytest.warns(UserWarning, match="1 of 3 episodes have more than 3 steps"):
+        buffer = load_dataset([{"dataset": arrays(5.0), "min_return": 1.0}, {"dataset": arrays(0.0)}], max_episode_steps=3)
+    assert buffer.episode_lengths.tolist() == [2, 3, 2, 3, 3]
+    assert buffer.episode_returns.tolist() == [5, 6, 0, 1, 0]
+
+
+def test_what_each_has_left_out_is_counted_together():
+    bad = {"obs": np.full((2, 3), np.nan), "acts": np.zeros((2, 2)), "rews": np.zeros(2)}
+    good = {"obs": np.zeros((2, 3)), "acts": np.zeros((2, 2)), "rews": np.zeros(2)}
+    with pytest.warns(UserWarning, match="dropped"):
+        buffer = load_dataset([{"dataset": each, "on_invalid": "drop"} for each in ([good, bad], [bad, good, bad])])
+    assert (buffer.n_episodes, buffer.n_dropped) == (2, 3)

@@ -76,8 +76,9 @@ def test_nothing_changes_where_no_episode_is_longer():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert buffer.within(12) is buffer
-    with pytest.raises(ValueError, match="at least 1"):
-        buffer.within(0)
+    for wrong in (0, 2.5, "2"):
+        with pytest.raises(ValueError, match="max_episode_steps must be a whole number of at least 1"):
+            buffer.within(wrong)
 
 
 def test_the_best_are_chosen_by_what_counts():

@@ -18,6 +18,7 @@ from sb3_dtfm.data import load_minari
 from sb3_dtfm.envs import (
     ReturnToGoWrapper,
     flatten_observation_space,
+    known_task,
     register_gymnasium_robotics,
     return_to_go_space,
 )
@@ -226,3 +227,19 @@ def test_success_has_the_name_that_sb3_counts_by(told, shown):
     *_, info = env.step(np.zeros(1))
     assert info == shown
     assert "is_success" not in told or told["is_success"] is False, "the environment's own is left alone"
+
+
+@pytest.mark.parametrize("vec_env_class", [DummyVecEnv, SubprocVecEnv])
+def test_the_task_is_known_where_its_whole_spec_cannot_leave_a_process(vec_env_class):
+    def make():
+        env = gym.make("Pendulum-v1", max_episode_steps=70)
+        return ReturnToGoWrapper(gym.wrappers.TransformReward(env, lambda reward: reward), target_return=0.0)
+
+    venv = vec_env_class([make])
+    try:
+        assert known_task(venv) == ("Pendulum-v1", 70)
+    finally:
+        venv.close()
+    bare = gym.make("Pendulum-v1").unwrapped
+    bare.spec = None
+    assert known_task(DummyVecEnv([lambda: ReturnToGoWrapper(bare, target_return=0.0)])) is None

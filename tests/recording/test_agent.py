@@ -226,6 +226,21 @@ def test_a_recording_that_breaks_leaves_nothing_behind(countdown_agent: Path, da
     assert minari.load_dataset("test/recorded-v0").total_episodes == 2
 
 
+def test_what_is_replaced_comes_back_where_that_is_interrupted(countdown_agent: Path, datasets_path: Path, monkeypatch):
+    record(countdown_agent, "Countdown-v0", 2)
+    before, rename = sorted(datasets_path.rglob("*")), Path.rename
+
+    def interrupted(path: Path, target: Path) -> Path:
+        if path.name == "new":
+            raise KeyboardInterrupt
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        record(countdown_agent, "Countdown-v0", 3, overwrite=True)
+    assert sorted(datasets_path.rglob("*")) == before
+
+
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
