@@ -3,9 +3,10 @@
 import contextlib
 import math
 import os
+import warnings
 import zipfile
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import h5py
@@ -35,6 +36,26 @@ SUCCESSES = ("successes", *SUCCESS, *(f"infos/{name}" for name in SUCCESS))
 NUMBERS_EXPECTED = "arrays of numbers are expected"
 # What TrajectoryBuffer.save adds.
 LOW, HIGH, ENV_ID = "action_low", "action_high", "env_id"
+# What is often beside, and tells nothing more.
+NOT_NEEDED = ("next_observations", "next_obs", "infos", "metadata")
+
+
+def warn_of_made_up_rewards(names: Iterable[str], source: str) -> None:
+    """
+    Where there are no rewards, say so if there is something that may have been meant by them, or by an end.
+
+    :param names: of all arrays
+    :param source: for the message
+    """
+    names = set(names)
+    read = {*OBSERVATIONS, *ACTIONS, *TERMINATIONS, *TRUNCATIONS, *SUCCESSES, ENDS, LENGTHS, LOW, HIGH, ENV_ID, *NOT_NEEDED}
+    unread = sorted(name for name in names - read if not name.startswith("infos/"))
+    if unread and not names & set(REWARDS):
+        warnings.warn(
+            f"{source}: there is none of {', '.join(REWARDS)}, so that success is rewarded, by 1 at an episode's last step. "
+            f"Not read: {', '.join(unread)}.",
+            stacklevel=2,
+        )
 
 
 def is_flat_file(dataset: Any) -> bool:
@@ -132,7 +153,7 @@ class _Arrays(ABC):
     def __init__(self, source: str, names: Collection[str], n_stored: int | None = None) -> None:
         self.source = source
         self.n_stored = n_stored
-        self._names = names
+        self.names = names
 
     @abstractmethod
     def _get(self, name: str, where: str) -> np.ndarray:
@@ -140,15 +161,15 @@ class _Arrays(ABC):
 
     def has(self, names: Sequence[str]) -> bool:
         """Whether there is one of these."""
-        return any(name in self._names for name in names)
+        return any(name in self.names for name in names)
 
     def name(self, names: Sequence[str]) -> str:
         """The first of the names that is there."""
         for name in names:
-            if name in self._names:
+            if name in self.names:
                 return name
         accepted = names[0] if len(names) == 1 else f"one of {', '.join(names)}"
-        found = ", ".join(sorted(map(str, self._names))) or "nothing"
+        found = ", ".join(sorted(map(str, self.names))) or "nothing"
         raise DatasetError(f"{self.source}: has no array {accepted}, only {found}.")
 
     def read(self, names: Sequence[str], n_steps: int | None = None) -> np.ndarray:
@@ -268,6 +289,7 @@ def _read(
     terminated, truncated = (_flags(arrays, names, n_steps) for names in (TERMINATIONS, TRUNCATIONS))
     stops = _stops(arrays, n_steps, terminated | truncated)
     has_rewards = arrays.has(REWARDS)
+    warn_of_made_up_rewards(set(map(str, arrays.names)) - set(keys), source)
     rewards = arrays.read(REWARDS, n_steps).reshape(n_steps, -1) if has_rewards else np.zeros((n_steps, 1))
     if rewards.shape[1] != 1:
         raise DatasetError(f"{source}: rewards have {rewards.shape[1]} columns; one number a step is expected.")

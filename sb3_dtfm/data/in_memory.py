@@ -23,6 +23,7 @@ from sb3_dtfm.data.flat import (
     bounded_space,
     check_shape,
     fitted,
+    warn_of_made_up_rewards,
 )
 from sb3_dtfm.data.observations import as_vectors, flatten_observations
 from sb3_dtfm.data.storage import FileStorage
@@ -71,6 +72,8 @@ def load_episodes(
         actions out of bounds; names the episode and the step
     """
     source = "episodes"
+    if len(episodes) and isinstance(episodes[0], Mapping):
+        warn_of_made_up_rewards(map(str, episodes[0]), source)
     space = bounded_space(action_bounds, action_space, _some_actions(episodes, action_space, source, on_invalid), source)
 
     def trajectory(number: int) -> Trajectory:

@@ -145,6 +145,13 @@ def test_an_unfit_episode_can_be_dropped_and_actions_clipped():
     assert load_dataset([{"obs": OBS, "acts": 9 * ACTS}], clip_actions=True).actions.abs().max() == 1.0
 
 
+def test_rewards_that_are_made_up_although_something_was_there_are_told_of():
+    episode = {"obs": np.zeros((3, 2)), "acts": ACTS, "rew": np.zeros(3), "done": np.zeros(3)}
+    for given in ([episode], {**episode, "episode_lengths": [3]}):
+        with pytest.warns(UserWarning, match=r"none of rewards, reward, rews, so that success is .* Not read: done, rew\."):
+            assert load_dataset(given).episode_returns.tolist() == [1.0]
+
+
 class Course(gym.Env):
     """Shows what was done: step and episode are observed, actions rewarded; every other episode ends itself."""
 
