@@ -327,6 +327,7 @@ def test_d3rlpy_and_ours_read_the_same_of_a_file(tmp_path, buffer):
 IN_README = {
     "walker2d-mediocre-noisy": "Walker2d, three mediocre agents, noisy",
     "halfcheetah-mediocre-noisy": "HalfCheetah, three mediocre agents, noisy",
+    "can-few": "Can, ten demonstrations by a script",
     "can-dropped": "Can, every second one dropped",
     "door-human": "Adroit's door, by 25 people",
     "door-mixed": "Adroit's door, by 25 people and ten times by a noisy agent",
