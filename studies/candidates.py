@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import torch as th
-from several_models import N_ENVS, SETTINGS
+from several_models import N_ENVS, SETTINGS, newest_hidden, replace_choice
 
 from sb3_dtfm import DTFM
 from sb3_dtfm.benchmark.evaluation import FINAL_STATES, evaluate, make_seeded_envs
 from sb3_dtfm.policies import SequencePolicy
-from sb3_dtfm.windows import Context, Windows
+from sb3_dtfm.windows import Windows
 
 
 def choose_together(policies: list[SequencePolicy], draws_of_all: bool) -> None:
@@ -28,30 +28,22 @@ def choose_together(policies: list[SequencePolicy], draws_of_all: bool) -> None:
     :param policies: with critics, of the same sizes, without `kv_cache`
     :param draws_of_all: whose candidates; the first one's alone otherwise
     """
-    first = policies[0]
-    for policy in policies:
-        policy.set_training_mode(False)
 
-    def choose(context: Context, due: np.ndarray, deterministic: bool) -> tuple[np.ndarray, np.ndarray]:
-        keys_values = np.zeros((len(due), 0), np.float32)
-        if not due.any():
-            return np.zeros((0, first.chunk_size, first.action_dim), np.float32), keys_values
-        windows = Windows(*(th.from_numpy(each[due]) for each in context.windows))
-        rows = context.timesteps[due, -1] + context.episode_keys[due]
+    def decide(windows: Windows, rows: np.ndarray, deterministic: bool) -> th.Tensor:
         seen = windows.observations[:, -1]
-        drawn = []
-        for each in policies if draws_of_all else policies[:1]:
-            hidden = each.hidden_states(each.acting_network, windows, last_only=True).squeeze(1)
-            drawn.append(each._draw_candidates(hidden, seen, rows, deterministic)[0])
+        drawn = [
+            each._draw_candidates(newest_hidden(each, windows), seen, rows, deterministic)[0]
+            for each in (policies if draws_of_all else policies[:1])
+        ]
         candidates = th.cat(drawn, dim=1)
         values = th.zeros(candidates.shape[:2])
         for each in policies:
             assert each.critic is not None
             states = each.normalization.scale_observation(seen).unsqueeze(1).expand(-1, candidates.shape[1], -1)
             values += each.critic(states, candidates[..., : each.n_valued * each.action_dim])
-        return first._to_chunks(candidates[th.arange(len(rows)), values.argmax(dim=1)]), keys_values
+        return candidates[th.arange(len(rows)), values.argmax(dim=1)]
 
-    first._choose = choose  # type: ignore[method-assign]
+    replace_choice(policies, decide)
 
 
 def main() -> None:

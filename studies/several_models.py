@@ -9,6 +9,7 @@ episodes of `sb3-dtfm benchmark` at Can.
 """
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from sb3_dtfm.windows import Context, Windows
 
 N_EPISODES, N_ENVS = 100, 10
 SETTINGS = {"env_wrapper": [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 1.0}}]}
+Decide = Callable[[Windows, np.ndarray, bool], th.Tensor]
 WAYS = ("mean", "median", "nearest", "one")
 
 
@@ -43,12 +45,12 @@ def agree(chunks: th.Tensor, way: str, rows: np.ndarray) -> th.Tensor:
     return chunks[chosen, th.arange(chunks.shape[1])]
 
 
-def decide_together(policies: list[SequencePolicy], way: str) -> None:
+def replace_choice(policies: list[SequencePolicy], decide: Decide) -> None:
     """
-    Let the first policy carry out what all of them decide.
+    Let the first policy carry out what is decided otherwise.
 
     :param policies: of the same sizes, without `kv_cache`
-    :param way: one of `WAYS`
+    :param decide: from the windows of b rows, what chooses their noise (b,), and whether to be deterministic, to (b, N)
     """
     first = policies[0]
     for policy in policies:
@@ -60,12 +62,29 @@ def decide_together(policies: list[SequencePolicy], way: str) -> None:
             return np.zeros((0, first.chunk_size, first.action_dim), np.float32), keys_values
         windows = Windows(*(th.from_numpy(each[due]) for each in context.windows))
         rows = context.timesteps[due, -1] + context.episode_keys[due]
-        noise = first._acting_noise(rows, deterministic)
-        hidden = [each.hidden_states(each.acting_network, windows, last_only=True).squeeze(1) for each in policies]
-        chunks = th.stack([each._decode(h, noise) for each, h in zip(policies, hidden, strict=True)])
-        return first._to_chunks(agree(chunks, way, rows)), keys_values
+        return first._to_chunks(decide(windows, rows, deterministic)), keys_values
 
     first._choose = choose  # type: ignore[method-assign]
+
+
+def newest_hidden(policy: SequencePolicy, windows: Windows) -> th.Tensor:
+    """Hidden states of the newest steps, (b, D)."""
+    return policy.hidden_states(policy.acting_network, windows, last_only=True).squeeze(1)
+
+
+def decide_together(policies: list[SequencePolicy], way: str) -> None:
+    """
+    Let the first policy carry out what all of them decide.
+
+    :param policies: of the same sizes, without `kv_cache`
+    :param way: one of `WAYS`
+    """
+
+    def decide(windows: Windows, rows: np.ndarray, deterministic: bool) -> th.Tensor:
+        noise = policies[0]._acting_noise(rows, deterministic)
+        return agree(th.stack([each._decode(newest_hidden(each, windows), noise) for each in policies]), way, rows)
+
+    replace_choice(policies, decide)
 
 
 def main() -> None:

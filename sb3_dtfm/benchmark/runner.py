@@ -73,7 +73,8 @@ class Runner:
         name = job.cell.file_name
         try:
             with contextlib.ExitStack() as locks:
-                for folder in (self.results, Path(self.options.log_folder)):  # which other calls may share
+                # Either may be another call's, too, or both the same.
+                for folder in {self.results.resolve(), Path(self.options.log_folder).resolve()}:
                     (folder / ".locks").mkdir(parents=True, exist_ok=True)
                     locks.enter_context(FileLock(folder / ".locks" / f"{name}.lock").acquire(timeout=0))
                 if (self.results / f"{name}.jsonl").exists():

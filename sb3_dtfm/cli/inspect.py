@@ -53,9 +53,9 @@ def load(dataset: str | list[str], options: dict[str, Any]) -> TrajectoryBuffer:
     register_gymnasium_robotics()
     spec = gym.registry.get(buffer.env_id or "")
     limit = None if spec is None else spec.max_episode_steps
-    longer = limit is not None and buffer.episode_lengths.max() > limit
-    as_learned = {**({"max_episode_steps": limit} if longer else {}), **options}
-    return buffer if as_learned.keys() <= options.keys() - CHOOSING else load_dataset(dataset, **as_learned)
+    if limit is not None and buffer.episode_lengths.max() > limit:
+        return load_dataset(dataset, **{"max_episode_steps": limit, **options})
+    return load_dataset(dataset, **options) if CHOOSING & options.keys() else buffer
 
 
 def _parser() -> argparse.ArgumentParser:

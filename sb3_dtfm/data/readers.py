@@ -67,9 +67,9 @@ def load_several(
 
     :param datasets: anything that :func:`load_dataset` takes, or `{"dataset": it, "weight": 2.0, ...}` with its other
         arguments; a step of one of weight 2 is learned from twice as often as one of weight 1
-    :param action_space: see :func:`load_dataset`, as of the others, which count for each that has none of its own
-    :param env_id:
-    :param max_episode_steps:
+    :param action_space: see :func:`load_dataset`; like the next two it counts for each that has none of its own
+    :param env_id: see :func:`load_dataset`
+    :param max_episode_steps: see :func:`load_dataset`
     :raises DatasetError: one of them cannot be read, or is of another task; a weight that is no positive number
     """
     buffers, weights = [], []

@@ -71,8 +71,7 @@ class OnlineDTFM(DTFM):
         self._running: list[Step] = []  # of the episodes that have not ended
         self._began: list[int] = []  # where each environment's episode begins in them
         self._state: tuple[np.ndarray, ...] | None = None  # of acting
-        self._turn_start = 0  # in gradient steps
-        self._n_left = 0  # gradient steps of a turn that was interrupted
+        self._n_left = 0  # of a turn's gradient steps
         super().__init__(*args, **kwargs)
 
     def _check_arguments(self, learning_rate: Rule) -> None:
@@ -81,7 +80,7 @@ class OnlineDTFM(DTFM):
 
     def _excluded_save_params(self) -> list[str]:
         """Also what is kept in a file of its own, or belongs to the environments."""
-        return [*super()._excluded_save_params(), "own", "_running", "_began", "_state", "_turn_start"]
+        return [*super()._excluded_save_params(), "own", "_running", "_began", "_state"]
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         """SB3's own, for the environments count here."""
@@ -97,7 +96,7 @@ class OnlineDTFM(DTFM):
 
     def _schedule_position(self) -> tuple[int, float]:
         """Each turn has the whole schedule: what a turn has changed settles before the next episodes."""
-        n_learned = self._n_updates - self._turn_start
+        n_learned = self.gradient_steps - self._n_left
         return n_learned, n_learned / self.gradient_steps
 
     def learn(
@@ -133,8 +132,8 @@ class OnlineDTFM(DTFM):
         parallel = DataParallel(self.policy, self._loss_function(), self.batch_size)
         self._training_seed = self._choose_training_seed()
         callback.on_training_start(locals(), globals())
-        if self._n_left and self.own is not None:
-            self._imitate(parallel, self._n_left)
+        if self._n_left and self.own is not None:  # of a turn that was interrupted
+            self._imitate(parallel, min(self._n_left, self.gradient_steps))
         n_turns = 0
         while self.num_timesteps < total_timesteps:
             # Of a turn's beginning: it ends with an episode, and the last one so beyond the steps that were asked for.
@@ -241,7 +240,6 @@ class OnlineDTFM(DTFM):
         :param n_steps: less than `gradient_steps` where others have been taken before an interrupt
         """
         batches = self._imitated()
-        self._turn_start = self._n_updates - (self.gradient_steps - n_steps)
         self._n_left = n_steps
         while self._n_left:
             self._train_step(batches, parallel)

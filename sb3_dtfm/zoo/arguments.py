@@ -34,14 +34,10 @@ def asking_for(target_return: float, env_wrapper: Any) -> list[Any]:
     :return: the same wrappers, of which a ReturnToGoWrapper asks for it
     """
     wrappers = env_wrapper if isinstance(env_wrapper, list) else [env_wrapper]
-    by_path = {
-        path: arguments
-        for each in wrappers
-        for path, arguments in (each if isinstance(each, dict) else {each: None}).items()
-    }
-    path = next((path for path in by_path if path.rsplit(".")[-1] == WRAPPER.rsplit(".")[-1]), WRAPPER)
-    by_path[path] = {**(by_path.get(path) or {}), "target_return": target_return}
-    return [{path: arguments} for path, arguments in by_path.items()]
+    named = [each if isinstance(each, dict) else {each: None} for each in wrappers]
+    own = [each for each in named if next(iter(each)).endswith(".ReturnToGoWrapper")] or [{WRAPPER: None}]
+    asking = {path: {**(arguments or {}), "target_return": target_return} for path, arguments in own[0].items()}
+    return [asking if each is own[0] else each for each in named] if own[0] in named else [*named, asking]
 
 
 def key_values(option: str, texts: Sequence[str]) -> dict[str, Any]:

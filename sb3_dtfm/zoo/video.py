@@ -73,8 +73,8 @@ def with_env_kwargs(model: FoundModel, arguments: Sequence[str]) -> list[str]:
     :param model: of the run
     :param arguments: the user's, whose own `--env-kwargs` count where both have one
     """
-    (settings,) = (path.parent for path in Path(model.run).glob("*/config.yml"))
-    words = [f"{name}:{value!r}" for name, value in (read_run(settings).get("env_kwargs") or {}).items()]
+    runs = [read_run(path.parent) for path in Path(model.run).glob("*/config.yml")]  # none of an agent from elsewhere
+    words = [f"{name}:{value!r}" for run in runs for name, value in (run.get("env_kwargs") or {}).items()]
     given = list(arguments)
     if words and "--env-kwargs" not in given:
         return [*given, "--env-kwargs", *words]

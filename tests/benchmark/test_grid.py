@@ -169,6 +169,12 @@ def test_a_cell_that_fails_leaves_a_log_and_the_grid_goes_on(instead, says, grid
     assert not finished.exists()
 
 
+def test_results_and_logs_may_share_a_folder(grid, stub, workplace):
+    stub("pass")
+    assert main([*grid, "--algo", "dt", "--fractions", "1", "-o", "mine", "-f", "mine"]) == 0
+    assert (workplace / "mine" / f"{TASK}_1_dt_seed0_tiny.jsonl").is_file()
+
+
 def test_an_interrupted_grid_ends_its_cells_and_says_so(grid, stub, workplace, monkeypatch, capfd):
     stub("pathlib.Path('asleep').touch(); time.sleep(600)")
     started = []

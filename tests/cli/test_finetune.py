@@ -33,6 +33,8 @@ def run(workplace):
         ([], [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 9.0}}]),
         (["my.Repeat", {"a.ReturnToGoWrapper": {"target_return": 5}}, {"my.Scale": {"by": 2}}],
          [{"my.Repeat": None}, {"a.ReturnToGoWrapper": {"target_return": 9.0}}, {"my.Scale": {"by": 2}}]),
+        ([{"my.Scale": {"by": 2}}, {"my.Scale": {"by": 3}}],
+         [{"my.Scale": {"by": 2}}, {"my.Scale": {"by": 3}}, {"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 9.0}}]),
         ("my.Repeat", [{"my.Repeat": None}, {"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 9.0}}]),
     ],
 )  # fmt: skip
@@ -111,6 +113,22 @@ def test_a_model_that_acts_by_its_mean_action_draws_when_it_is_steered(run, work
     assert "which no noise changes: n_solver_steps=3 instead" in capsys.readouterr().out
     steered = SteeredDTFM.load(workplace / "logs/steered/HalfCheetah-v5_1/HalfCheetah-v5")
     assert steered.policy.acting_settings()["n_solver_steps"] == 3
+
+
+def test_where_noise_is_steered_no_critic_chooses(workplace, capsys):
+    critic = ["critic_steps:1", "n_candidates:3", "embed_dim:16", "n_layers:1", "n_heads:1", "flow_hidden_dim:16"]
+    assert main(tiny_training("dtfm", "dataset:" + repr(DATASET_ID), *critic)) == 0
+    run = workplace / "logs/dtfm/HalfCheetah-v5_1"
+    assert main([*FINETUNE, "--model", str(run), "-params", *QUICK, "learning_starts:100"]) == 0
+    assert "The model's critic chooses among 3 draws; here an algorithm chooses the noise of one" in capsys.readouterr().out
+    steered = SteeredDTFM.load(workplace / "logs/steered/HalfCheetah-v5_1/HalfCheetah-v5")
+    assert steered.policy.acting_settings()["n_candidates"] == 1
+    config = run / "HalfCheetah-v5" / "config.yml"
+    settings = yaml.unsafe_load(config.read_text())
+    settings["vec_env_wrapper"] = "stable_baselines3.common.vec_env.VecMonitor"
+    config.write_text(yaml.dump(settings))
+    assert main([*FINETUNE, "--model", str(run)]) == 2
+    assert "it learned in stable_baselines3.common.vec_env.VecMonitor, where" in capsys.readouterr().err
 
 
 def test_ppo_and_a_zip_file_with_a_target_of_its_own(run, workplace):

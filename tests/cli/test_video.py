@@ -72,6 +72,7 @@ def test_the_environment_is_that_of_the_runs_settings(tmp_path):
         (tmp_path / "Pendulum-v1" / name).write_text(yaml.dump(OrderedDict(values)))
     model = FoundModel("final-model", "model.zip", str(tmp_path))
     assert with_env_kwargs(model, ["-n", "3"]) == ["-n", "3", "--env-kwargs", "g:5.0"]
+    assert with_env_kwargs(model._replace(run=str(tmp_path / "elsewhere")), ["-n", "3"]) == ["-n", "3"]
     assert with_env_kwargs(model, ["--env-kwargs", "g:1.0"]) == ["--env-kwargs", "g:5.0", "g:1.0"], "the last one counts"
 
 

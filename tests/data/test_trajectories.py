@@ -1,10 +1,12 @@
 """One episode: its return-to-go, and what makes it unfit for learning."""
 
+import zlib
+
 import numpy as np
 import pytest
 
 from sb3_dtfm.data import TrajectoryBuffer
-from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, check_trajectory, returns_to_go
+from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, check_size, check_trajectory, returns_to_go
 from tests.data.small import ACTION_SPACE, OBSERVATION_SPACE, make_trajectory
 
 
@@ -53,3 +55,12 @@ def test_large_numbers_that_fit_into_float32_are_kept(dtype: type):
     buffer = TrajectoryBuffer.from_trajectories([make_trajectory(6, observations=observations)], ACTION_SPACE)
     np.testing.assert_array_equal(buffer.observations.numpy(), observations.astype(np.float32))
     assert buffer.statistics().observation_mean[2] == pytest.approx(5e37, rel=1e-6)
+
+
+def test_what_compresses_best_is_taken_and_what_no_compression_makes_is_not():
+    n_bytes = 2**25
+    n_stored = len(zlib.compress(bytes(n_bytes), 9))
+    assert n_bytes > 1000 * n_stored
+    check_size(n_bytes, n_stored, "rewards")
+    with pytest.raises(DatasetError, match=f"rewards claim {2**26} bytes, of which {n_stored} are stored"):
+        check_size(2**26, n_stored, "rewards")

@@ -247,9 +247,8 @@ def final_interval(runs: Sequence[Run]) -> Interval:
         return over_runs
     over_episodes = _pooled_success([run.final for run in runs])
     low, high = np.clip(over_runs[1:], 0.0, 100.0).tolist()
-    return (
-        over_episodes if not high - low > over_episodes.high - over_episodes.low else Interval(over_runs.estimate, low, high)
-    )
+    wider = high - low > over_episodes.high - over_episodes.low
+    return Interval(over_runs.estimate, low, high) if wider else over_episodes
 
 
 def late_interval(runs: Sequence[Run]) -> Interval | None:
