@@ -14,14 +14,16 @@ from peers.protocol import Dataset, serve
 
 # robomimic imports torchvision, for images, which ours has none of. PyPI's is built for GPUs: beside a PyTorch for CPUs it
 # misses its own operators, and that they are known by name is enough for its import.
-_OPERATORS = th.library.Library("torchvision", "FRAGMENT")
-for _name in ("nms", "qnms"):
-    _OPERATORS.define(f"{_name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+# A PyTorch for GPUs must not have them twice.
+if th.version.cuda is None:
+    _OPERATORS = th.library.Library("torchvision", "FRAGMENT")
+    for _name in ("nms", "qnms"):
+        _OPERATORS.define(f"{_name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
 
-from robomimic.algo import algo_factory  # noqa: E402
-from robomimic.config import config_factory  # noqa: E402
-from robomimic.utils import obs_utils  # noqa: E402
-from robomimic.utils.dataset import SequenceDataset  # noqa: E402
+from robomimic.algo import algo_factory
+from robomimic.config import config_factory
+from robomimic.utils import obs_utils
+from robomimic.utils.dataset import SequenceDataset
 
 OBSERVATION = "observation"
 STEPS_PER_EPOCH = 100
