@@ -3,10 +3,10 @@ Train DTFM at the paper's size on one GPU, as fast as it goes, evaluated by othe
 
     python studies/gpu_training.py --dataset local/halfcheetah/expert-v0 --env HalfCheetah-v5 --target-return 12000
 
-First measures: no synchronisation inside the loop (one would raise), milliseconds a step, and the share of the GPU's
-peak that matrix products take (model FLOP utilisation). Then trains; a checkpoint every 1,000 steps is evaluated on the
-CPU's other cores, and `evaluations.jsonl` gets a line for each. `--device cpu --compile` with a small `--width`, `--layers`
-and `--steps` goes the same way without a GPU.
+First measures: no synchronisation inside the loop (one would raise), milliseconds a step, the share of the GPU's
+peak that matrix products take (model FLOP utilisation), and how long its kernels take by torch's profiler. Then trains;
+a checkpoint every 1,000 steps is evaluated on the CPU's other cores, and `evaluations.jsonl` gets a line for each.
+`--device cpu --compile` with a small `--width`, `--layers` and `--steps` goes the same way without a GPU.
 """
 
 import argparse
@@ -21,12 +21,14 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
+from torch.autograd import DeviceType
+from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_dtfm import DTFM
 from sb3_dtfm.envs import ReturnToGoWrapper
 
-WARM_UP_STEPS, MEASURED_STEPS = 30, 200
+WARM_UP_STEPS, MEASURED_STEPS, PROFILED_STEPS = 30, 200, 10
 
 
 def evaluate(checkpoint: str, env_id: str, target_return: float, n_episodes: int, seed: int) -> dict[str, object]:
@@ -73,6 +75,18 @@ def matrix_flops(model: DTFM) -> float:
     return counter.get_total_flops()
 
 
+def print_kernels(model: DTFM) -> None:
+    """Print how many kernels a step has and how long the GPU is busy with them."""
+    with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as profiler:
+        model.learn(PROFILED_STEPS, log_interval=None)
+        th.cuda.synchronize()
+    kernels = [
+        each for each in profiler.key_averages() if each.device_type == DeviceType.CUDA and not each.is_user_annotation
+    ]
+    count, busy_us = sum(each.count for each in kernels), sum(each.self_device_time_total for each in kernels)
+    print(f"{count / PROFILED_STEPS:.0f} kernels a step, {busy_us / 1e3 / PROFILED_STEPS:.2f} ms a step", flush=True)
+
+
 def measure(model: DTFM, peak_flops: float) -> None:
     """Print milliseconds a step and model FLOP utilisation of the learn loop, compilation left out."""
     on_gpu = model.device.type == "cuda"
@@ -91,6 +105,8 @@ def measure(model: DTFM, peak_flops: float) -> None:
     model.learn(WARM_UP_STEPS + MEASURED_STEPS, stamp, log_interval=None)
     seconds = (stamps[1] - stamps[0]) / MEASURED_STEPS
     flops = matrix_flops(model)
+    if on_gpu:
+        print_kernels(model)
     print(
         f"{seconds * 1e3:.2f} ms a step, {flops / 1e9:.0f} GFLOP of matrix products a step, "
         f"model FLOP utilisation {flops / seconds / peak_flops:.1%} of {peak_flops / 1e12:.0f} TFLOP/s",
