@@ -252,8 +252,11 @@ class TrajectoryBuffer(FlatSteps):
         """
         A buffer of some of the episodes, in the order given, on the same flat tensors.
 
-        :param episodes: (E',) episode indices
+        :param episodes: (E',) episode indices, at least one
+        :raises ValueError: none
         """
+        if not len(episodes):
+            raise ValueError(f"{self.source}: select was given no episode; at least one of {self.n_episodes} is needed.")
         chosen = copy.copy(self)
         chosen.weights = self.weights[episodes]
         chosen._set_episodes(self.episodes.select(episodes))
@@ -346,12 +349,15 @@ class TrajectoryBuffer(FlatSteps):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """
-        Write the buffer's own steps as flat arrays, which `dataset=` and `--dataset` take.
+        Write the buffer's own steps as flat arrays, which `dataset=` and `--dataset` take; of `weights`, a warning says that
+        they are not among them.
 
         :param path: of the file; `.npz` is added where it is missing
         :raises OSError: it cannot be written; what was there before still is
         """
         path = with_npz(path)
+        if (self.weights != self.weights[0]).any():
+            warnings.warn(f"{path}: has no weights of episodes; give them again when it is read.", stacklevel=2)
         rows, stops = self.rows, self._stops.cpu().numpy()
         ended = {name: np.zeros(len(self), bool) for name in ("terminations", "truncations")}
         ended["terminations"][stops - 1], ended["truncations"][stops - 1] = self.terminated, self.truncated

@@ -1,12 +1,9 @@
 """Reading flat arrays, episode after episode, into a `TrajectoryBuffer`: of an `.npz` file, an hdf5 file, or memory."""
 
 import contextlib
-import math
 import os
 import warnings
-import zipfile
-from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import h5py
@@ -14,16 +11,14 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_dtfm.actions import ActionSpace, bounds_of, choices_between
+from sb3_dtfm.data.arrays import ENV_ID, EXPECTED, NPZ_SUFFIX, Arrays, opened
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, existing_file
-from sb3_dtfm.data.hdf5 import read_hdf5
-from sb3_dtfm.data.observations import as_vectors, check_no_images
+from sb3_dtfm.data.observations import check_no_images
 from sb3_dtfm.data.storage import FileStorage
-from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_flags, check_real, check_size, naming
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_flags
 from sb3_dtfm.envs.success import SUCCESS
 
-NPZ_SUFFIX = ".npz"
-EXPECTED = "the path of a file of flat arrays (.npz, .hdf5)"
 # What others call the same array: the first that is there is read.
 OBSERVATIONS = ("observations", "observation", "obs", "states", "state")
 ACTIONS = ("actions", "action", "acts")
@@ -32,10 +27,8 @@ ENDS, LENGTHS = "episode_ends", "episode_lengths"
 TERMINATIONS = ("terminations", "terminals", "terminated", "terminal")
 TRUNCATIONS = ("truncations", "timeouts", "truncated")
 SUCCESSES = ("successes", *SUCCESS, *(f"infos/{name}" for name in SUCCESS))
-# Of what is no file.
-NUMBERS_EXPECTED = "arrays of numbers are expected"
-# What TrajectoryBuffer.save adds.
-LOW, HIGH, ENV_ID = "action_low", "action_high", "env_id"
+# What TrajectoryBuffer.save adds, beside ENV_ID.
+LOW, HIGH = "action_low", "action_high"
 # What is often beside, and tells nothing more.
 NOT_NEEDED = ("next_observations", "next_obs", "infos", "metadata")
 
@@ -137,141 +130,12 @@ def load_flat(
     :raises DatasetError: no such file, damaged, arrays missing or of lengths that do not fit together, NaN or infinity, or
         actions out of bounds; names the file, the array, the episode and the step
     """
-    with _opened(dataset) as arrays:
+    with opened(dataset) as arrays:
         return _read(arrays, observation_keys, action_bounds, clip_actions, action_space, on_invalid, storage)
 
 
-class _Arrays(ABC):
-    """
-    Arrays by name, none of which is read before it has been looked at.
-
-    :param source: what they are called, for messages
-    :param names: of all that are there
-    :param n_stored: bytes of the file, None in memory
-    """
-
-    def __init__(self, source: str, names: Collection[str], n_stored: int | None = None) -> None:
-        self.source = source
-        self.n_stored = n_stored
-        self.names = names
-
-    @abstractmethod
-    def _get(self, name: str, where: str) -> np.ndarray:
-        """A whole array of numbers."""
-
-    def has(self, names: Sequence[str]) -> bool:
-        """Whether there is one of these."""
-        return any(name in self.names for name in names)
-
-    def name(self, names: Sequence[str]) -> str:
-        """The first of the names that is there."""
-        for name in names:
-            if name in self.names:
-                return name
-        accepted = names[0] if len(names) == 1 else f"one of {', '.join(names)}"
-        found = ", ".join(sorted(map(str, self.names))) or "nothing"
-        raise DatasetError(f"{self.source}: has no array {accepted}, only {found}.")
-
-    def read(self, names: Sequence[str], n_steps: int | None = None) -> np.ndarray:
-        """The first of the named arrays that is there: numbers, one entry a step."""
-        name = self.name(names)
-        where = f"{self.source}: {name}"
-        with naming(where):
-            array = self._get(name, where)
-        check_real(array.dtype, where)
-        if n_steps is not None and array.shape[:1] != (n_steps,):
-            raise DatasetError(f"{where} has shape {array.shape} and actions have {n_steps} steps.")
-        return array
-
-    def env_id(self) -> str | None:
-        """The environment that :meth:`TrajectoryBuffer.save` has written."""
-        return None
-
-
-class _Npz(_Arrays):
-    """Of an opened archive."""
-
-    def __init__(self, archive: zipfile.ZipFile, source: str) -> None:
-        self._archive = archive
-        self._members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
-        super().__init__(source, self._members, os.path.getsize(source))
-
-    def _get(self, name: str, where: str) -> np.ndarray:
-        check_real(self._header(name, where), where)
-        return self._stored(name)
-
-    def env_id(self) -> str | None:
-        where = f"{self.source}: {ENV_ID}"
-        if not self.has((ENV_ID,)):
-            return None
-        with naming(where):
-            dtype = self._header(ENV_ID, where)
-            array = self._stored(ENV_ID) if dtype.kind == "U" else np.zeros(0)
-        if array.size != 1:
-            raise DatasetError(f"{where} holds {dtype} of shape {array.shape}; the id of an environment is expected.")
-        return str(array.reshape(()))
-
-    def _stored(self, name: str) -> np.ndarray:
-        with self._archive.open(self._members[name]) as stream:
-            return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
-
-    def _header(self, name: str, where: str) -> np.dtype:
-        """Refuse what an array claims to be before memory is taken for it."""
-        member = self._members[name]
-        with self._archive.open(member) as stream:
-            version = np.lib.format.read_magic(stream)
-            read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, _, dtype = read_header(stream)
-            n_left = member.file_size - stream.tell()
-        n_bytes = math.prod(shape) * dtype.itemsize
-        if n_bytes != n_left and not dtype.hasobject:
-            raise DatasetError(f"{where} has shape {shape}, which takes {n_bytes} bytes; there are {n_left}.")
-        check_size(n_bytes, self.n_stored or 0, where)
-        return dtype
-
-
-class _Hdf5(_Arrays):
-    """Of an opened file, at its top."""
-
-    def __init__(self, file: h5py.File, source: str) -> None:
-        infos = file.get("infos")
-        within = {f"infos/{name}" for name in infos} if isinstance(infos, h5py.Group) else set()
-        super().__init__(source, {*file, *within}, os.path.getsize(source))
-        self._file = file
-
-    def _get(self, name: str, where: str) -> np.ndarray:
-        return read_hdf5(self._file, name, self.source)
-
-
-class _InMemory(_Arrays):
-    """Of anyone's own; observations may be a dictionary of arrays."""
-
-    def __init__(self, arrays: Mapping[str, Any]) -> None:
-        super().__init__("arrays", arrays)
-        self._arrays = arrays
-
-    def _get(self, name: str, where: str) -> np.ndarray:
-        found = self._arrays[name]
-        with naming(where, NUMBERS_EXPECTED):
-            return as_vectors(found, where) if isinstance(found, Mapping) else np.asarray(found)
-
-
-@contextlib.contextmanager
-def _opened(dataset: str | os.PathLike[str] | Mapping[str, Any]) -> Iterator[_Arrays]:
-    if isinstance(dataset, Mapping):
-        yield _InMemory(dataset)
-        return
-    path = existing_file(dataset, EXPECTED)
-    source = str(path)
-    with naming(source), contextlib.ExitStack() as stack:
-        if path.name.endswith(NPZ_SUFFIX):
-            yield _Npz(stack.enter_context(zipfile.ZipFile(path)), source)
-        else:
-            yield _Hdf5(stack.enter_context(h5py.File(path, "r")), source)
-
-
 def _read(
-    arrays: _Arrays,
+    arrays: Arrays,
     observation_keys: Sequence[str] | None,
     action_bounds: Sequence[Any] | None,
     clip_actions: bool,
@@ -327,21 +191,21 @@ def _read(
     )
 
 
-def _observations(arrays: _Arrays, key: str, n_steps: int) -> np.ndarray:
+def _observations(arrays: Arrays, key: str, n_steps: int) -> np.ndarray:
     """(N, .), of one array."""
     array = arrays.read((key,), n_steps)
     check_no_images(array, f"{arrays.source}: {key}")
     return array.reshape(n_steps, -1)
 
 
-def _flags(arrays: _Arrays, names: Sequence[str], n_steps: int) -> np.ndarray:
+def _flags(arrays: Arrays, names: Sequence[str], n_steps: int) -> np.ndarray:
     """(N,) bool, all False where there is no such array."""
     if not arrays.has(names):
         return np.zeros(n_steps, bool)
     return check_flags(arrays.read(names), n_steps, f"{arrays.source}: {arrays.name(names)}")
 
 
-def _successes(arrays: _Arrays, n_steps: int, stops: np.ndarray) -> np.ndarray:
+def _successes(arrays: Arrays, n_steps: int, stops: np.ndarray) -> np.ndarray:
     """(E,): 1, 0, or NaN of an episode of which nothing tells."""
     if not arrays.has(SUCCESSES):
         return np.full(len(stops), np.nan)
@@ -353,7 +217,7 @@ def _successes(arrays: _Arrays, n_steps: int, stops: np.ndarray) -> np.ndarray:
     return np.where(silent.reshape(told.shape), np.nan, told)
 
 
-def _stops(arrays: _Arrays, n_steps: int, ended: np.ndarray) -> np.ndarray:
+def _stops(arrays: Arrays, n_steps: int, ended: np.ndarray) -> np.ndarray:
     """Steps of the file at which each episode has ended, (E,) int64, ascending, the last one N."""
     told = [_told_stops(arrays, name, n_steps) for name in (ENDS, LENGTHS) if arrays.has((name,))]
     if len(told) == 2 and not np.array_equal(told[0], told[1]):
@@ -367,7 +231,7 @@ def _stops(arrays: _Arrays, n_steps: int, ended: np.ndarray) -> np.ndarray:
     raise DatasetError(f"{arrays.source}: does not say where episodes end; one of {accepted} is needed.")
 
 
-def _told_stops(arrays: _Arrays, name: str, n_steps: int) -> np.ndarray:
+def _told_stops(arrays: Arrays, name: str, n_steps: int) -> np.ndarray:
     """As :func:`_stops`, from the array of this name."""
     array = arrays.read((name,))
     with np.errstate(invalid="ignore"):

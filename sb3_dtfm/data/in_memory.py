@@ -11,10 +11,10 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_dtfm.actions import ActionSpace
+from sb3_dtfm.data.arrays import NUMBERS_EXPECTED
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.flat import (
     ACTIONS,
-    NUMBERS_EXPECTED,
     OBSERVATIONS,
     REWARDS,
     SUCCESSES,

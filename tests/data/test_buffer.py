@@ -280,6 +280,19 @@ def test_select_takes_whole_episodes_in_the_order_given():
     assert chosen.timesteps.tolist() == [0, 1, 2, 3, 0, 1, 2, 3, 4]
 
 
+def test_select_of_nothing_is_refused():
+    with pytest.raises(ValueError, match=r"select was given no episode; at least one of 2 is needed"):
+        make_buffer([5, 1]).select(np.array([], int))
+
+
+def test_saving_says_that_weights_are_left_out(tmp_path, recwarn):
+    buffer = make_buffer([5, 1])
+    buffer.save(tmp_path / "alike")
+    assert not recwarn
+    with pytest.warns(UserWarning, match=r"weighted\.npz: has no weights of episodes; give them again"):
+        type(buffer).join([buffer, buffer], [1.0, 2.0]).save(tmp_path / "weighted")
+
+
 def test_select_shares_the_arrays_and_can_be_repeated():
     buffer = make_buffer([5, 1, 4, 2])
     chosen = buffer.select(np.array([3, 0, 2])).select(np.array([2, 0]))
