@@ -36,12 +36,13 @@ def choose_together(policies: list[SequencePolicy], draws_of_all: bool) -> None:
             for each in (policies if draws_of_all else policies[:1])
         ]
         candidates = th.cat(drawn, dim=1)
-        values = th.zeros(candidates.shape[:2])
+        gains = th.zeros(candidates.shape[:2])
         for each in policies:
             assert each.critic is not None
-            states = each.normalization.scale_observation(seen).unsqueeze(1).expand(-1, candidates.shape[1], -1)
-            values += each.critic(states, candidates[..., : each.n_valued * each.action_dim])
-        return candidates[th.arange(len(rows)), values.argmax(dim=1)]
+            gains += each.critic.gains(
+                each.normalization.scale_observation(seen), candidates[..., : each.n_valued * each.action_dim]
+            )
+        return candidates[th.arange(len(rows)), gains.argmax(dim=1)]
 
     replace_choice(policies, decide)
 

@@ -325,19 +325,20 @@ class ActingPolicy(BasePolicy):
 
         :param hidden: (b, D)
         :param observations: (b, O) as the environment gives them
-        :param rows: (b,) of the noise table; the first candidate's are these
+        :param rows: (b,) of the noise table; the first candidate's are these, and what it would be without others
         :return: (b, N, H A) in [-1, 1], and (b,) int64
         """
         assert self.critic is not None
         n, turns = self.n_candidates, np.arange(self.n_candidates)
         noise = self._acting_noise((rows[:, None] + CANDIDATE_STRIDE * turns).ravel(), deterministic).to(hidden.device)
-        noise = self.candidate_noise * noise
-        candidates = self._decode(hidden.repeat_interleave(n, dim=0), noise).view(len(hidden), n, -1)
+        noise = noise.view(len(hidden), n, -1)
+        noise[:, 1:] *= self.candidate_noise
+        candidates = self._decode(hidden.repeat_interleave(n, dim=0), noise.flatten(0, 1)).view(len(hidden), n, -1)
         chance = self._acting_noise((rows[:, None] + CHOICE_START + CHOICE_STRIDE * turns).ravel(), deterministic)
         uniform = th.special.ndtr(chance[:, 0]).clamp(1e-6, 1 - 1e-6).view(len(hidden), n).to(hidden.device)
-        states = self.normalization.scale_observation(observations).unsqueeze(1).expand(-1, n, -1)
-        values = self.critic(states, candidates[..., : self.n_valued * self.action_dim])
-        return candidates, self.critic.choose(values, self.temperature, uniform)
+        seen = self.normalization.scale_observation(observations)
+        gains = self.critic.gains(seen, candidates[..., : self.n_valued * self.action_dim])
+        return candidates, self.critic.choose(gains, self.temperature, uniform)
 
     def _acting_noise(self, rows: np.ndarray, deterministic: bool) -> th.Tensor:
         """What the newest step's actions start from, (B, noise_dim): of these rows of the table, (B,), or fresh."""

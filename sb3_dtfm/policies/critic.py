@@ -66,6 +66,19 @@ class Critic(nn.Module):
         pairs = th.cat((observations, actions), dim=-1)
         return th.minimum(*(q(pairs).squeeze(-1) for q in self.q_target))
 
+    def gains(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        How much more than the first of N actions each of them is worth, by the Q that finds less: another one is worth more
+        only where both Qs say so. What they misjudge alike in all actions of an observation is no part of it.
+
+        :param observations: (B, O), normalised
+        :param actions: (B, N, h A) in [-1, 1]
+        :return: (B, N), 0 of the first
+        """
+        pairs = th.cat((observations.unsqueeze(1).expand(-1, actions.shape[1], -1), actions), dim=-1)
+        values = th.stack([q(pairs).squeeze(-1) for q in self.q_target])
+        return (values - values[..., :1]).amin(dim=0)
+
     def loss(self, batch: Transitions) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """
         :param batch: observations normalised, actions in [-1, 1]
@@ -75,7 +88,7 @@ class Critic(nn.Module):
         with th.no_grad():
             future = self.value(batch.next_observations).squeeze(-1)
             backup = self.reward_scale * batch.rewards + batch.discounts * future
-            valued = th.minimum(*(q(pairs).squeeze(-1) for q in self.q_target))
+            valued = self(batch.observations, batch.actions)
         advantage = valued - self.value(batch.observations).squeeze(-1)
         weight = th.where(advantage > 0, self.expectile, 1.0 - self.expectile)
         value_loss = _mean(weight * advantage.square(), batch.mask)
@@ -108,17 +121,18 @@ class Critic(nn.Module):
         th._foreach_lerp_(followers, [parameter.data for parameter in self.q.parameters()], TARGET_SHARE)
         return parts
 
-    def choose(self, values: th.Tensor, temperature: float, uniform: th.Tensor) -> th.Tensor:
+    def choose(self, gains: th.Tensor, temperature: float, uniform: th.Tensor) -> th.Tensor:
         """
-        One of N actions, with probabilities softmax(Q / (temperature * spread of advantages)) (Hansen-Estruch et al., 2023).
+        One of N actions, with probabilities softmax(gain / (temperature * spread of advantages)); with Q in its place in
+        Hansen-Estruch et al. (2023).
 
-        :param values: (B, N)
+        :param gains: (B, N), of :meth:`gains`
         :param temperature: 0 takes the largest
         :param uniform: (B, N) in (0, 1), what chance decides by (Gumbel's trick)
         :return: (B,) int64
         """
         chance = -(-uniform.log()).log()
-        return (values + temperature * self.spread * chance).argmax(dim=-1)
+        return (gains + temperature * self.spread * chance).argmax(dim=-1)
 
 
 def _mlp(input_dim: int, hidden_dim: int) -> nn.Sequential:

@@ -167,18 +167,30 @@ def test_of_the_draws_the_most_valuable_one_is_taken(cheetah_buffer, solver):
         "return_to_go": np.full((50, 1), 10.0, np.float32),
         "timestep": np.zeros((50, 1), np.int64),
     }
-    values = {}
+    first, gains = None, {}
+    seen = model.policy.normalization.scale_observation(observation)
     for n_candidates in (1, 8, 32):
         model.policy.set_acting(solver=solver, n_candidates=n_candidates)
         _, state = model.predict(observations, deterministic=True, episode_start=np.ones(50, bool))
         context = Context(*state)
         planned = np.concatenate([context.actions[:, -1:], context.plan], axis=1)[:, : model.policy.n_valued].reshape(50, -1)
+        first = planned if first is None else first
         with th.no_grad():
-            seen = model.policy.normalization.scale_observation(observation)
-            values[n_candidates] = model.policy.critic(seen, th.from_numpy(planned)).numpy()
-    assert (values[8] >= values[1] - 1e-6).all()
-    assert (values[32] >= values[8] - 1e-6).all()
-    assert (values[32] > values[1] + 1e-4).mean() > 0.5
+            both = th.from_numpy(np.stack([first, planned], axis=1))
+            gains[n_candidates] = model.policy.critic.gains(seen, both)[:, 1].numpy()
+    assert (gains[8] >= -1e-6).all()
+    assert (gains[32] >= gains[8] - 1e-6).all()
+    assert (gains[32] > 1e-4).mean() > 0.5
+
+
+def test_another_action_is_worth_more_where_both_values_say_so():
+    critic = Critic(1, 1)
+    for q, slope in zip(critic.q_target, (1.0, 3.0), strict=True):
+        q.forward = lambda pairs, slope=slope: 100.0 * pairs[..., :1] + slope * pairs[..., 1:]
+    seen, actions = th.tensor([[5.0], [-5.0]]), th.tensor([[0.2], [0.5], [0.1]]).expand(2, 3, 1)
+    th.testing.assert_close(critic.gains(seen, actions), th.tensor([[0.0, 0.3, -0.3]]).expand(2, 3), atol=1e-4, rtol=0)
+    critic.q_target[1].forward = lambda pairs: -pairs[..., 1:]  # disagrees about all of them
+    assert critic.choose(critic.gains(seen, actions), 0.0, th.full((2, 3), 0.5)).tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("candidate_noise", [1.0, 1.5])
@@ -192,7 +204,8 @@ def test_candidates_start_from_noise_as_wide_as_is_said(cheetah_buffer, candidat
         candidates, _ = policy._draw_candidates(hidden, cheetah_buffer.observations[:5], rows, deterministic=True)
         for turn in range(4):
             noise = policy.noise_table[th.from_numpy(rows + CANDIDATE_STRIDE * turn) % len(policy.noise_table)]
-            th.testing.assert_close(candidates[:, turn], policy._decode(hidden, candidate_noise * noise))
+            width = candidate_noise if turn else 1.0  # the first is the action without a critic
+            th.testing.assert_close(candidates[:, turn], policy._decode(hidden, width * noise))
     with pytest.raises(ValueError, match="candidate_noise"):
         policy.set_acting(candidate_noise=0.0)
 
