@@ -96,8 +96,8 @@ class SequencePolicy(ActingPolicy):
     :param gamma: discount of a step for the critic
     :param expectile: of the critic
     :param n_candidates: actions, or chunks, that are drawn each time, of which the critic has one taken; 1 asks no critic
-    :param candidate_noise: standard deviation of the noise that all but the first of them start from; above 1, which the flow
-        has learned, they differ more, and the critic has more to choose among
+    :param candidate_noise: standard deviation of the noise that all but the first of them start from; above 1, which the
+        flow has learned, they differ more, and the critic has more to choose among
     :param temperature: how much chance that choice leaves, in units of how far actions' values spread in the data; 0, the
         default, takes the one that both values of the critic find better than the first, by the larger gain
     :param ema: keep an exponential moving average of the weights and act with it
