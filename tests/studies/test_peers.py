@@ -11,7 +11,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from peers import cells, command, table
+from matplotlib.axes import Axes
+from peers import cells, command, figure, table
 from peers.process import PeerError, PeerProcess
 from peers.protocol import read_dataset, receive, send
 
@@ -336,6 +337,17 @@ IN_README = {
     "door-mixed": "Adroit's door, by 25 people and ten times by a noisy agent",
 }
 README_COLUMNS = ("dtfm, guided", "dtfm", "dt", "bc", "bc-best", "d3rlpy-dt", "iql", "td3-bc", "rebrac", "bc-rnn-gmm")
+
+
+def test_the_picture_shows_all_rows(tmp_path, monkeypatch):
+    drawn = []
+    plot = Axes.plot
+    monkeypatch.setattr(Axes, "plot", lambda self, x, y, *a, **k: drawn.extend(x) or plot(self, x, y, *a, **k))
+    figure.plot(ROOT / "results" / "peers", tmp_path / "peers.png")
+    assert (tmp_path / "peers.png").stat().st_size > 10_000
+    assert len(drawn) == len(list(table.long_table(ROOT / "results" / "peers"))) - 1  # but for the header
+    assert min(drawn) >= 0
+    assert max(drawn) == 1
 
 
 def test_readme_and_the_page_say_what_the_rows_say():
