@@ -125,7 +125,10 @@ class OfflineExperimentManager(ExperimentManager):
 
         :param model: to train
         :raises TrainingError: whatever went wrong
+        :raises UsageError: another process is training the run that is to be resumed
         """
+        if self.keeper is not None:
+            self.keeper.hold()  # until the model is saved
         learning = model
         try:
             if self.resumed is not None:
@@ -140,6 +143,8 @@ class OfflineExperimentManager(ExperimentManager):
         except Exception as error:
             if self.signals.asked:  # Ctrl-C reaches the environments' processes, too
                 return
+            if self.keeper is not None:
+                self.keeper.release()
             message = f"Training ended after {model.num_timesteps} timesteps: {type(error).__name__}: {error}"
             raise TrainingError(message) from error
 
@@ -161,5 +166,7 @@ class OfflineExperimentManager(ExperimentManager):
             print(
                 f"Interrupted after {model.num_timesteps} steps; sb3-dtfm {self.command} --resume {self.save_path} goes on."
             )
+        if self.keeper is not None:
+            self.keeper.release()
         if self.signals.terminated and not ended:
             raise SystemExit(128 + signal.SIGTERM)

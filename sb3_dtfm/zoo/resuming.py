@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch.distributed as dist
+from filelock import FileLock, Timeout
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import TensorBoardOutputFormat, configure
@@ -24,6 +25,8 @@ from sb3_dtfm.zoo.arguments import UsageError
 
 # In a run's folder while it is unfinished: the model as it was, and how the run was started.
 CHECKPOINT, START = "checkpoint.zip", "start.json"
+# Held by the process that trains it.
+LOCK = ".lock"
 # Beside a model that learns online: its own episodes.
 EPISODES = "episodes.npz"
 CHECKPOINT_INTERVAL = 60.0  # seconds of training that a killed run loses at most
@@ -126,8 +129,21 @@ class KeepCheckpoint(BaseCallback):
         self.signals = signals
         self.start = start
         self.ended = False  # training has, by itself
+        self._lock = FileLock(run / LOCK)
         self._saved_at = 0.0
         self._ending = False
+
+    def hold(self) -> None:
+        """
+        Keep the run to this process.
+
+        :raises UsageError: another one is training it
+        """
+        try:
+            with contextlib.suppress(NotImplementedError):  # a file system without locks
+                self._lock.acquire(timeout=0)
+        except Timeout:
+            raise UsageError(f"--resume {self.path.parent}: another process is training it.") from None
 
     def _on_training_start(self) -> None:
         self._saved_at = time.monotonic()
@@ -155,6 +171,11 @@ class KeepCheckpoint(BaseCallback):
         """The run is finished: nothing to go on from."""
         self.path.unlink(missing_ok=True)
         (self.path.parent / START).unlink(missing_ok=True)
+
+    def release(self) -> None:
+        """Leave the run to others."""
+        self.path.with_name(LOCK).unlink(missing_ok=True)
+        self._lock.release()
 
 
 class ReplaceEvaluations(BaseCallback):

@@ -38,9 +38,23 @@ class SignalAt(BaseCallback):
         return True
 
 
-def training(*callbacks: tuple[int, int]) -> list[str]:
+def finds_tests() -> dict[str, str]:
+    """An environment for processes that find the callbacks above."""
+    return {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+
+
+class ResumeAt(SignalAt):
+    """Has another process resume the run that is in its midst."""
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.step:
+            subprocess.run([sys.executable, "-m", "sb3_dtfm", "train", "--resume", str(RUN)], env=finds_tests())
+        return True
+
+
+def training(*callbacks: tuple[int, int], kind: str = "SignalAt") -> list[str]:
     """The command; seeds are drawn by RL-Zoo unless a test says otherwise."""
-    signals = [{"tests.zoo.test_resuming.SignalAt": {"step": step, "number": int(number)}} for step, number in callbacks]
+    signals = [{f"{__name__}.{kind}": {"step": step, "number": int(number)}} for step, number in callbacks]
     return tiny_training("dtfm", *([f"callback:{signals!r}"] if signals else []), *SETTINGS, "--seed", "3")
 
 
@@ -132,8 +146,7 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint_or_from_the_start(interva
         "resuming.KeepCheckpoint.save = lambda keeper: save(keeper) if keeper.num_timesteps <= 18 else None\n"
         f"main({training((KILL_AT, signal.SIGKILL))!r})\n"
     )
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    killed = subprocess.run([sys.executable, "-c", script], env=environment, stdout=subprocess.DEVNULL)
+    killed = subprocess.run([sys.executable, "-c", script], env=finds_tests(), stdout=subprocess.DEVNULL)
     assert killed.returncode == -signal.SIGKILL
     assert (RUN / START).is_file()
     assert (RUN / CHECKPOINT).is_file() == (interval == 0.0)
@@ -167,6 +180,13 @@ def test_what_an_agent_knew_is_not_lost_with_a_run_that_was_killed_early(workpla
     assert main(["train", "--resume", str(second)]) == 0
     model = DTFM.load(second / "HalfCheetah-v5.zip")  # which the same signal has interrupted again
     assert (model.num_timesteps, model._n_updates) == (SIGNAL_AT + 1, N_STEPS + SIGNAL_AT + 1)
+
+
+def test_a_run_that_is_being_trained_is_left_to_its_process(straight, workplace, capfd):
+    assert main(training((SIGNAL_AT, 0), kind="ResumeAt")) == 0
+    assert f"--resume {RUN}: another process is training it." in capfd.readouterr().err
+    assert_same(what_was_learned(), straight)
+    assert not list(RUN.glob(".*"))
 
 
 @pytest.mark.parametrize(
