@@ -327,6 +327,7 @@ def test_d3rlpy_and_ours_read_the_same_of_a_file(tmp_path, buffer):
 
 IN_README = {
     "walker2d-clean": "Walker2d, one good agent",
+    "walker2d-half": "Walker2d, half of that",
     "walker2d-mediocre-noisy": "Walker2d, three mediocre agents, noisy",
     "halfcheetah-mediocre-noisy": "HalfCheetah, three mediocre agents, noisy",
     "halfcheetah-ladder": "HalfCheetah, five agents, the best among them",
