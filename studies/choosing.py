@@ -4,8 +4,7 @@ How a critic's two values should choose among draws (docs/studies/random-walks.m
     python studies/choosing.py MODEL --env AdroitHandDoor-v1 --target-return 3000 --ways one gain smaller >> choosing.jsonl
 
 `one` asks no critic; `gain` is what the package does; `smaller` takes the draw whose smaller value is largest, `mean` that
-of the largest mean; `margin` takes another draw than the first only for a gain above the spread of advantages in the data;
-`doubt` takes five times half of what the two values disagree by off the mean gain, where `gain` takes it off once.
+of the largest mean; `margin` takes another draw than the first only for a gain above the spread of advantages in the data.
 Episodes are final ones of `sb3-dtfm benchmark` from `--first` on, the same for all ways.
 """
 
@@ -22,8 +21,7 @@ from sb3_dtfm.benchmark.evaluation import FINAL_STATES, evaluate, make_seeded_en
 from sb3_dtfm.policies.critic import Critic
 from sb3_dtfm.zoo.arguments import import_packages, key_values
 
-WAYS = ("one", "gain", "smaller", "mean", "margin", "doubt")
-DOUBT = 5.0
+WAYS = ("one", "gain", "smaller", "mean", "margin")
 N_ENVS = 10
 
 
@@ -38,9 +36,6 @@ def change(critic: Critic, way: str) -> None:
             return found
         pairs = th.cat((observations.unsqueeze(1).expand(-1, actions.shape[1], -1), actions), dim=-1)
         values = th.stack([q(pairs).squeeze(-1) for q in critic.q_target])
-        if way == "doubt":
-            found = values - values[..., :1]
-            return found.mean(dim=0) - DOUBT * 0.5 * (found[0] - found[1]).abs()
         return values.amin(dim=0) if way == "smaller" else values.mean(dim=0)
 
     if way not in ("one", "gain"):

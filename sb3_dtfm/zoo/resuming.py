@@ -143,7 +143,9 @@ class KeepCheckpoint(BaseCallback):
             with contextlib.suppress(NotImplementedError):  # a file system without locks
                 self._lock.acquire(timeout=0)
         except Timeout:
-            raise UsageError(f"--resume {self.path.parent}: another process is training it.") from None
+            raise UsageError(
+                f"--resume {self.path.parent}: another process is training it; wait for its end, or end it first."
+            ) from None
 
     def _on_training_start(self) -> None:
         self._saved_at = time.monotonic()

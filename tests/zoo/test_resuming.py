@@ -184,7 +184,7 @@ def test_what_an_agent_knew_is_not_lost_with_a_run_that_was_killed_early(workpla
 
 def test_a_run_that_is_being_trained_is_left_to_its_process(straight, workplace, capfd):
     assert main(training((SIGNAL_AT, 0), kind="ResumeAt")) == 0
-    assert f"--resume {RUN}: another process is training it." in capfd.readouterr().err
+    assert f"--resume {RUN}: another process is training it; wait for its end, or end it first." in capfd.readouterr().err
     assert_same(what_was_learned(), straight)
     assert not list(RUN.glob(".*"))
 
