@@ -5,9 +5,10 @@ What fine-tuning brought: runs of `sb3-dtfm finetune` as rows, and their curves.
         --like mine/robosuite-Can-v0_0.05_dtfm_seed0_small.jsonl --label own-episodes --output results/finetuning
     python studies/finetuning.py plot results/finetuning --labels own-episodes --output docs/studies/finetuning.png
 
-`measure` plays 100 final episodes, as `sb3-dtfm benchmark` does, with the model before (rows of the label "before") and with
-the last one after, and takes the curve from the run's evaluations.npz. Its steps are the environments', its seconds those
-until then, evaluations included. `--like` is the cell of the model before: its rows tell task, data and seed.
+`measure` plays 100 final episodes, as `sb3-dtfm benchmark` does, with the model before (rows of the label "before"), with the
+last one after, and with the best of its evaluations (rows of the label with "-best"), and takes the curve from the run's
+evaluations.npz. Its steps are the environments', its seconds those until then, evaluations included. `--like` is the cell of
+the model before: its rows tell task, data and seed.
 """
 
 import argparse
@@ -49,11 +50,16 @@ def measure(run: Path, before: Path, like: Row, label: str, output: Path) -> Non
     settings = {**like["settings"], **settings}
     envs = make_seeded_envs(like["task"], settings, N_ENVS)
     times = environment_steps(run)
-    for path, name in ((before, BEFORE), (run, label)):
-        rows = [] if name == BEFORE else curve(run)
-        steps = rows[-1]["step"] if rows else 0
+    evaluations = curve(run)
+    with np.load(run / "evaluations.npz") as saved:
+        best_steps = int(saved["timesteps"][saved["results"].mean(axis=1).argmax()])  # the first of equal ones, as SB3 keeps
+    for path, name, earlier, steps in (
+        (before / folder.name, BEFORE, [], 0),
+        (run / folder.name, label, evaluations, evaluations[-1]["step"]),
+        (run / "best_model", f"{label}-best", [], best_steps),
+    ):
         row = {**like, "settings": settings, "label": name, "commit": provenance.commit(), "versions": provenance.versions()}
-        rows.append({"step": steps, "final": True, **final_episodes(path, folder.name, envs)})
+        rows = [*earlier, {"step": steps, "final": True, **final_episodes(path, envs)}]
         file = output / f"{Cell.of(row).file_name}.jsonl"
         file.unlink(missing_ok=True)
         for each in rows:
@@ -95,17 +101,16 @@ def curve(run: Path) -> list[dict[str, Any]]:
     return list(rows.values())
 
 
-def final_episodes(run: Path, name: str, envs: Any) -> dict[str, Any]:
+def final_episodes(path: Path, envs: Any) -> dict[str, Any]:
     """
-    What a run's last model reaches from the initial states of final evaluations.
+    What a model of a run reaches from the initial states of final evaluations.
 
-    :param run: its folder, in that of its algorithm
-    :param name: of its file
+    :param path: its file, without the suffix, in its run's folder, which lies in that of the algorithm
     :param envs: to act in
     """
-    model = load_agent(run.parent.name, run / f"{name}.zip", "cpu")
+    model = load_agent(path.parents[1].name, path.with_suffix(f"{path.suffix}.zip"), "cpu")
     seeds = range(FINAL_STATES, FINAL_STATES + N_EPISODES)
-    with tqdm(total=N_EPISODES, desc=str(run)) as bar:
+    with tqdm(total=N_EPISODES, desc=str(path)) as bar:
         return evaluate(model, envs, seeds, lambda n: bar.update(n - bar.n) and None)._asdict()
 
 

@@ -20,12 +20,16 @@ def test_a_run_is_measured_and_shown(workplace):
     like = dict(cell._asdict(), settings={"batch_size": 4}, data={"n_episodes": 3}, solver="euler", n_solver_steps=1)
     (workplace / "rows").mkdir()
     finetuning.measure(workplace / "logs/dtfm/HalfCheetah-v5_2", before, like, "own", workplace / "rows")
-    ((before, after),) = [
-        [next(iter(group.runs.values()))[0] for group in study.groups] for study in read_studies([workplace / "rows"])
-    ]
+    (study,) = read_studies([workplace / "rows"])
+    runs = {group.label: next(iter(group.runs.values()))[0] for group in study.groups}
+    before, after, best = (runs[label] for label in ("before", "own", "own-best"))
     assert [row["step"] for row in after.evaluations] == [0, 40, 80]
     assert [len(row["returns"]) for row in after.evaluations] == [3, 3, 3]
     assert not before.evaluations
+    assert not best.evaluations
+    with np.load(workplace / "logs/dtfm/HalfCheetah-v5_2/evaluations.npz") as evaluations:
+        means = evaluations["results"].mean(axis=1)
+        assert best.final["step"] == evaluations["timesteps"][means.argmax()]
     assert before.final["lengths"] == after.final["lengths"] == [20] * 100
     assert before.final["returns"] != after.final["returns"]
     assert after.final["settings"]["gradient_steps"] == 2
