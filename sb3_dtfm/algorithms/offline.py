@@ -174,9 +174,11 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         return 3 * self.batch_size * self.context_length * self.policy.network.n_products
 
     def _loss_function(self) -> LossFunction:
-        """The policy's loss in the precision asked for, compiled where that pays."""
-        compile_it = self.device.type == "cuda" if self.compile is None else self.compile
-        compute_loss = th.compile(self.policy.compute_loss) if compile_it else self.policy.compute_loss
+        """The policy's loss in the precision asked for, compiled where that pays; a GPU's kernels start as one graph."""
+        on_gpu = self.device.type == "cuda"
+        compute_loss = self.policy.compute_loss
+        if on_gpu if self.compile is None else self.compile:
+            compute_loss = th.compile(compute_loss, mode="reduce-overhead" if on_gpu else "default")
         return autocast(self.precision, self.device)(compute_loss)
 
     def _gradient_step(self, batch: Windows, generator: th.Generator, parallel: DataParallel) -> None:
