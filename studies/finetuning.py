@@ -5,8 +5,8 @@ What fine-tuning brought: runs of `sb3-dtfm finetune` as rows, and their curves.
         --like mine/robosuite-Can-v0_0.05_dtfm_seed0_small.jsonl --label own-episodes --output results/finetuning
     python studies/finetuning.py plot results/finetuning --labels own-episodes --output docs/studies/finetuning.png
 
-`measure` plays 100 final episodes, as `sb3-dtfm benchmark` does, with the model before (rows of the label "before"), with the
-last one after, and with the best of its evaluations (rows of the label with "-best"), and takes the curve from the run's
+`measure` plays 100 final episodes, as `sb3-dtfm benchmark` does, with the model before (rows of the label "before"), with
+the last one after, and with the best of its evaluations (rows of the label with "-best"), and takes the curve from the run's
 evaluations.npz. Its steps are the environments', its seconds those until then, evaluations included. `--like` is the cell of
 the model before: its rows tell task, data and seed.
 """

@@ -17,7 +17,7 @@ from sb3_dtfm.algorithms.base import OfflineAlgorithm
 from sb3_dtfm.arguments import POSITIVE
 from sb3_dtfm.callbacks import GradientStepProgressBar, NormalizedScoreCallback, find_eval_callbacks
 from sb3_dtfm.data import TrajectoryBuffer
-from sb3_dtfm.distributed import DataParallel, LossFunction, is_first_process
+from sb3_dtfm.distributed import DataParallel, LossFunction, is_first_process, n_processes
 from sb3_dtfm.optimization import (
     BATCHES,
     DROPOUT,
@@ -174,11 +174,13 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         return 3 * self.batch_size * self.context_length * self.policy.network.n_products
 
     def _loss_function(self) -> LossFunction:
-        """The policy's loss in the precision asked for, compiled where that pays; a GPU's kernels start as one graph."""
+        """The policy's loss in the precision asked for, compiled where that pays."""
         on_gpu = self.device.type == "cuda"
         compute_loss = self.policy.compute_loss
         if on_gpu if self.compile is None else self.compile:
-            compute_loss = th.compile(compute_loss, mode="reduce-overhead" if on_gpu else "default")
+            # "reduce-overhead" starts a GPU's kernels as one graph: Python takes three times as long to start each.
+            as_graph = on_gpu and n_processes() == 1
+            compute_loss = th.compile(compute_loss, mode="reduce-overhead" if as_graph else "default")
         return autocast(self.precision, self.device)(compute_loss)
 
     def _gradient_step(self, batch: Windows, generator: th.Generator, parallel: DataParallel) -> None:
