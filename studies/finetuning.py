@@ -3,7 +3,8 @@ What fine-tuning brought: runs of `sb3-dtfm finetune` as rows, and their curves.
 
     python studies/finetuning.py measure logs/dtfm/robosuite-Can-v0_2 --before logs/dtfm/robosuite-Can-v0_1 \\
         --like mine/robosuite-Can-v0_0.05_dtfm_seed0_small.jsonl --label own-episodes --output results/finetuning
-    python studies/finetuning.py plot results/finetuning --labels own-episodes --output docs/studies/finetuning.png
+    python studies/finetuning.py plot results/finetuning --task HalfCheetah-v5 --labels steered sac sac-with-data \
+        --output docs/studies/finetuning.png
 
 `measure` plays 100 final episodes, as `sb3-dtfm benchmark` does, with the model before (rows of the label "before"), with
 the last one after, and with the best of its evaluations (rows of the label with "-best"), and takes the curve from the run's
@@ -23,7 +24,8 @@ from tqdm import tqdm
 
 from sb3_dtfm.benchmark import provenance
 from sb3_dtfm.benchmark.evaluation import FINAL_STATES, evaluate, make_seeded_envs
-from sb3_dtfm.benchmark.report.runs import read_studies
+from sb3_dtfm.benchmark.report.runs import Group, Run, read_studies, row_value
+from sb3_dtfm.benchmark.report.statistics import student_t
 from sb3_dtfm.benchmark.rows import Cell, Row, read_rows, write_row
 from sb3_dtfm.files import read_run
 from sb3_dtfm.finetuning import STEERED
@@ -114,12 +116,13 @@ def final_episodes(path: Path, envs: Any) -> dict[str, Any]:
         return evaluate(model, envs, seeds, lambda n: bar.update(n - bar.n) and None)._asdict()
 
 
-def plot(folder: Path, labels: list[str], output: Path) -> None:
+def plot(folder: Path, task: str, labels: list[str], output: Path) -> None:
     """
-    A curve for each seed, and the mean of the final episodes, before and after, as dots.
+    Curves of the seeds, their mean with a 95 % interval (Student's t), and the means of the final episodes as dots.
 
     :param folder: of rows
-    :param labels: to show
+    :param task: to show
+    :param labels: likewise
     :param output: the PNG
     """
     groups = {group.label: group for study in read_studies([folder]) for group in study.groups}
@@ -127,26 +130,26 @@ def plot(folder: Path, labels: list[str], output: Path) -> None:
     FigureCanvasAgg(figure)
     axes = figure.subplots()
     for number, label in enumerate(labels):
-        for (_, _, _), runs in groups[label].runs.items():
-            last = max(run.final["step"] for run in runs)
-            for run in runs:
-                steps = [row["step"] for row in run.evaluations]
-                values = [solved(row) for row in run.evaluations]
-                axes.plot(steps, values, color=f"C{number}", alpha=0.5, linewidth=1.2)
-            after = np.mean([solved(run.final) for run in runs])
-            axes.plot(
-                last, after, "o", color=f"C{number}", label=f"{label}: {after:,.0f} in the final episodes", clip_on=False
-            )
-    began = [solved(run.final) for runs in groups[BEFORE].runs.values() for run in runs]
-    axes.plot(0, np.mean(began), "o", color="black", label=f"before: {np.mean(began):,.0f}", clip_on=False)
+        runs = runs_of(groups[label], task)
+        steps = [row["step"] for row in runs[0].evaluations]
+        values = np.array([[row_value(row) for row in run.evaluations] for run in runs])  # (runs, evaluations)
+        mean, low, high = np.transpose([student_t(column) for column in values.T]).astype(float)
+        color = f"C{number}"
+        axes.plot(steps, values.T, color=color, alpha=0.3, linewidth=0.8)
+        axes.fill_between(steps, low, high, color=color, alpha=0.15, linewidth=0)
+        axes.plot(steps, mean, color=color)
+        after = np.mean([row_value(run.final) for run in runs])
+        axes.plot(steps[-1], after, "o", color=color, label=f"{label}: {after:,.0f} in the final episodes", clip_on=False)
+    began = np.mean([row_value(run.final) for run in runs_of(groups[BEFORE], task)])
+    axes.plot(0, began, "o", color="black", label=f"{BEFORE}: {began:,.0f}", clip_on=False)
     axes.set(xlabel="environment steps", ylabel="solved, %, or return")
     axes.legend()
     figure.savefig(output, dpi=110)
 
 
-def solved(row: Row) -> float:
-    """Percent of the episodes, or the mean return."""
-    return float(np.mean(row["returns"]) if row["successes"] is None else 100 * np.mean(row["successes"]))
+def runs_of(group: Group, task: str) -> list[Run]:
+    """All seeds of a task."""
+    return [run for (of_task, _, _), runs in group.runs.items() if of_task == task for run in runs]
 
 
 def main() -> None:
@@ -160,11 +163,12 @@ def main() -> None:
     measuring("--output", type=Path, required=True)
     plotting = commands.add_parser("plot").add_argument
     plotting("folder", type=Path)
+    plotting("--task", required=True)
     plotting("--labels", nargs="+", required=True)
     plotting("--output", type=Path, required=True)
     options = parser.parse_args()
     if options.command == "plot":
-        plot(options.folder, options.labels, options.output)
+        plot(options.folder, options.task, options.labels, options.output)
         return
     options.output.mkdir(parents=True, exist_ok=True)
     measure(options.run, options.before, read_rows(options.like)[-1], options.label, options.output)

@@ -38,7 +38,7 @@ def test_a_run_is_measured_and_shown(workplace):
     assert seconds[0] == 0.0
     assert (np.diff(seconds) >= 0).all()
     assert seconds[-1] > 0
-    finetuning.plot(workplace / "rows", ["own"], workplace / "curves.png")
+    finetuning.plot(workplace / "rows", "HalfCheetah-v5", ["own"], workplace / "curves.png")
     assert (workplace / "curves.png").stat().st_size > 5000
 
 
