@@ -19,7 +19,7 @@ from sb3_dtfm.windows import Context
 # Of the noise, as in diffusion steering (Wagenmaker et al., 2025).
 NOISE_BOUND = 1.5
 # Of a model that acts by one, which leaves nothing to choose.
-STEERED_SOLVER_STEPS = 2
+STEERED_SOLVER_STEPS = 3
 
 
 class NoiseSpace(spaces.Box):

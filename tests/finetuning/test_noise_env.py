@@ -226,5 +226,5 @@ def test_what_cannot_be_steered_is_refused():
         NoiseActionVecEnv(make_venv(), _tiny(), bound=-1)
     mean_action = _tiny()
     mean_action.policy.set_acting(n_solver_steps=1)
-    with pytest.raises(ValueError, match=r"one step of Euler ends at the mean action.*set_acting\(n_solver_steps=2\)"):
+    with pytest.raises(ValueError, match=r"one step of Euler ends at the mean action.*set_acting\(n_solver_steps=3\)"):
         NoiseActionVecEnv(make_venv(), mean_action)
