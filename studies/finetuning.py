@@ -3,7 +3,7 @@ What fine-tuning brought: runs of `sb3-dtfm finetune` as rows, and their curves.
 
     python studies/finetuning.py measure logs/dtfm/robosuite-Can-v0_2 --before logs/dtfm/robosuite-Can-v0_1 \\
         --like mine/robosuite-Can-v0_0.05_dtfm_seed0_small.jsonl --label own-episodes --output results/finetuning
-    python studies/finetuning.py plot results/finetuning --task HalfCheetah-v5 --labels steered sac sac-with-data \
+    python studies/finetuning.py plot results/finetuning --task HalfCheetah-v5 --labels steered sac sac-with-data \\
         --output docs/studies/finetuning.png
 
 `measure` plays 100 final episodes, as `sb3-dtfm benchmark` does, with the model before (rows of the label "before"), with
@@ -56,9 +56,9 @@ def measure(run: Path, before: Path, like: Row, label: str, output: Path) -> Non
     with np.load(run / "evaluations.npz") as saved:
         best_steps = int(saved["timesteps"][saved["results"].mean(axis=1).argmax()])  # the first of equal ones, as SB3 keeps
     for path, name, earlier, steps in (
-        (before / folder.name, BEFORE, [], 0),
-        (run / folder.name, label, evaluations, evaluations[-1]["step"]),
-        (run / "best_model", f"{label}-best", [], best_steps),
+        (before / f"{folder.name}.zip", BEFORE, [], 0),
+        (run / f"{folder.name}.zip", label, evaluations, evaluations[-1]["step"]),
+        (run / "best_model.zip", f"{label}-best", [], best_steps),
     ):
         row = {**like, "settings": settings, "label": name, "commit": provenance.commit(), "versions": provenance.versions()}
         rows = [*earlier, {"step": steps, "final": True, **final_episodes(path, envs)}]
@@ -107,10 +107,10 @@ def final_episodes(path: Path, envs: Any) -> dict[str, Any]:
     """
     What a model of a run reaches from the initial states of final evaluations.
 
-    :param path: its file, without the suffix, in its run's folder, which lies in that of the algorithm
+    :param path: its file, in its run's folder, which lies in that of the algorithm
     :param envs: to act in
     """
-    model = load_agent(path.parents[1].name, path.with_suffix(f"{path.suffix}.zip"), "cpu")
+    model = load_agent(path.parents[1].name, path, "cpu")
     seeds = range(FINAL_STATES, FINAL_STATES + N_EPISODES)
     with tqdm(total=N_EPISODES, desc=str(path)) as bar:
         return evaluate(model, envs, seeds, lambda n: bar.update(n - bar.n) and None)._asdict()

@@ -89,7 +89,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
     :param learning_rate_schedule: factor on the learning rate: "constant", or "linear" or "cosine" down to zero
     :param ema_decay: decay of the exponential moving average of weights that acts; 0 acts with the trained weights
     :param precision: "float32", "bfloat16" (autocast), or "auto": bfloat16 where the hardware multiplies in it
-    :param compile: compile the loss with `torch.compile`; None does so on a GPU. It takes a minute, and a C++ compiler
+    :param compile: compile the loss with `torch.compile`; None does so on a GPU, where one process starts its kernels as a
+        CUDA graph. It takes a minute, and a C++ compiler
     :param policy_kwargs: arguments of the policy, for example `embed_dim`, `n_layers`, `n_heads`, `dropout`, `kv_cache`
     :param stats_window_size: as in SB3; offline learning collects no episodes
     :param tensorboard_log: folder of the TensorBoard log, None for no log

@@ -177,8 +177,9 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         """The policy's loss in the precision asked for, compiled where that pays."""
         on_gpu = self.device.type == "cuda"
         compute_loss = self.policy.compute_loss
-        if on_gpu if self.compile is None else self.compile:
-            # "reduce-overhead" starts a GPU's kernels as one graph: Python takes three times as long to start each.
+        if self.compile or (self.compile is None and on_gpu):
+            # "reduce-overhead" starts a GPU's kernels as one graph; one by one a step takes three times as long. With
+            # several processes it is not measured.
             as_graph = on_gpu and n_processes() == 1
             compute_loss = th.compile(compute_loss, mode="reduce-overhead" if as_graph else "default")
         return autocast(self.precision, self.device)(compute_loss)

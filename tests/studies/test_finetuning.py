@@ -1,5 +1,7 @@
 """What fine-tuning brought is measured and shown."""
 
+import shutil
+
 import finetuning
 import numpy as np
 import pytest
@@ -19,7 +21,9 @@ def test_a_run_is_measured_and_shown(workplace):
     cell = Cell("HalfCheetah-v5", 1.0, "dtfm", 0, "tiny")
     like = dict(cell._asdict(), settings={"batch_size": 4}, data={"n_episodes": 3}, solver="euler", n_solver_steps=1)
     (workplace / "rows").mkdir()
-    finetuning.measure(workplace / "logs/dtfm/HalfCheetah-v5_2", before, like, "own", workplace / "rows")
+    run = workplace / "logs/dtfm/HalfCheetah-v5_2"
+    shutil.copy(before / "HalfCheetah-v5.zip", run / "best_model.zip")  # one that is known not to be the last
+    finetuning.measure(run, before, like, "own", workplace / "rows")
     (study,) = read_studies([workplace / "rows"])
     runs = {group.label: next(iter(group.runs.values()))[0] for group in study.groups}
     before, after, best = (runs[label] for label in ("before", "own", "own-best"))
@@ -27,7 +31,8 @@ def test_a_run_is_measured_and_shown(workplace):
     assert [len(row["returns"]) for row in after.evaluations] == [3, 3, 3]
     assert not before.evaluations
     assert not best.evaluations
-    with np.load(workplace / "logs/dtfm/HalfCheetah-v5_2/evaluations.npz") as evaluations:
+    assert best.final["returns"] == before.final["returns"]
+    with np.load(run / "evaluations.npz") as evaluations:
         means = evaluations["results"].mean(axis=1)
         assert best.final["step"] == evaluations["timesteps"][means.argmax()]
     assert before.final["lengths"] == after.final["lengths"] == [20] * 100
