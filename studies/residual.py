@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_dtfm import DTFM
 from sb3_dtfm.envs import ReturnToGoWrapper
-from sb3_dtfm.finetuning.noise_env import OBSERVATION_CLIP
+from sb3_dtfm.policies.normalization import OBSERVATION_CLIP
 from sb3_dtfm.windows import Context
 
 EVERY, N_EPISODES, N_EVAL_ENVS = 10_000, 20, 10
