@@ -87,6 +87,7 @@ def main() -> None:
     parser.add_argument("--env", default="HalfCheetah-v5")
     parser.add_argument("--target-return", type=float, required=True)
     parser.add_argument("--bound", type=float, default=0.1)
+    parser.add_argument("--gradient-steps", type=int, default=2, help="for each step of the four environments")
     parser.add_argument("-n", "--n-timesteps", type=int, default=80_000)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
@@ -105,7 +106,7 @@ def main() -> None:
         "MlpPolicy",
         make(4, options.seed),
         learning_starts=10_000,
-        gradient_steps=2,
+        gradient_steps=options.gradient_steps,
         ent_coef="auto_0.1",
         policy_kwargs=dict(net_arch=[256, 256]),
         seed=options.seed,

@@ -23,6 +23,7 @@ TARGETS = {
     "Humanoid-v5": 12000,
     "robosuite/Lift-v0": 1,
     "robosuite/Can-v0": 1,
+    "robosuite/Square-v0": 1,
 }
 HEAD_KEYS = set(HEADS["DTFM"].options())
 SETTINGS = [None, "small"]
@@ -34,6 +35,7 @@ SMALL_STEPS = {
     "Humanoid-v5": 2500,
     "robosuite/Lift-v0": 1200,
     "robosuite/Can-v0": 2000,
+    "robosuite/Square-v0": 6000,
 }
 
 
