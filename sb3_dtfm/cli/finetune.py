@@ -12,10 +12,11 @@ from sb3_dtfm.zoo.resuming import Start
 EXAMPLES = """\
   sb3-dtfm finetune --model logs/dtfm/robosuite-Can-v0_1 --env robosuite/Can-v0 --algo dtfm -n 100000
   sb3-dtfm finetune --model logs/dtfm/robosuite-Lift-v0_1 --env robosuite/Lift-v0 --algo sac -n 20000
+  sb3-dtfm finetune --model logs/dtfm/HalfCheetah-v5_1 --env HalfCheetah-v5 --algo ppo -n 1000000
   sb3-dtfm enjoy --algo steered --env robosuite/Lift-v0 --load-best
 """
 # Timesteps between two evaluations: the environments' steps where a DTFM learns itself, decisions where it is steered.
-EVAL_FREQ, EVAL_FREQ_ONLINE = 1000, 10_000
+EVAL_FREQ, USUAL_EVAL_FREQ = {ONLINE: 10_000, "ppo": 100_000}, 1000
 
 
 def main(argv: Sequence[str]) -> None:
@@ -41,7 +42,7 @@ def main(argv: Sequence[str]) -> None:
     if "-optimize" in rest or "--optimize-hyperparameters" in rest:
         raise UsageError("-optimize: hyperparameters of finetune cannot be searched; -params changes them.")
     config = options.conf_file or finetuning_config(options.algo)
-    usual = EVAL_FREQ_ONLINE if options.algo == ONLINE else EVAL_FREQ
+    usual = EVAL_FREQ.get(options.algo, USUAL_EVAL_FREQ)
     eval_freq = usual if options.eval_freq is None else options.eval_freq
     given = ["--algo", options.algo, "--conf-file", str(config), "--eval-freq", str(eval_freq)]
     arguments = [*given, "--eval-episodes", str(options.eval_episodes), *rest]
@@ -54,7 +55,7 @@ def _parser() -> argparse.ArgumentParser:
         add_help=False,
         usage="sb3-dtfm finetune --model MODEL --env ENV [options] [RL-Zoo options]",
         description="Go on learning online: a DTFM from its own episodes (--algo dtfm), or an SB3 algorithm "
-        "that chooses the noise of a frozen one.",
+        "that chooses the noise of a frozen one, or corrects its actions.",
         epilog=f"examples:\n{EXAMPLES}\nRL-Zoo's own options follow.\n",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -67,7 +68,8 @@ def _parser() -> argparse.ArgumentParser:
         "--eval-freq",
         type=int,
         metavar="N",
-        help=f"timesteps between two evaluations; {EVAL_FREQ} decisions by default, {EVAL_FREQ_ONLINE} steps with dtfm",
+        help=f"timesteps between two evaluations; {USUAL_EVAL_FREQ} decisions by default, "
+        + ", ".join(f"{freq} with {algo}" for algo, freq in EVAL_FREQ.items()),
     )
     argument("--eval-episodes", type=int, default=20, metavar="N", help="of an evaluation; 20 by default")
     argument("--resume", metavar="RUN", help="go on with an interrupted run of --algo dtfm, as logs/dtfm/HalfCheetah-v5_2")

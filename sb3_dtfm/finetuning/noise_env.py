@@ -5,15 +5,11 @@ from os import PathLike
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_dtfm.algorithms import DTFM
 from sb3_dtfm.algorithms.offline import OfflineSequenceAlgorithm
-from sb3_dtfm.arguments import POSITIVE, check_arguments
-from sb3_dtfm.envs import BETWEEN, OBSERVATION, RETURN_TO_GO, TIMESTEP, check_vec_env
+from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
 from sb3_dtfm.policies import SequencePolicy
-from sb3_dtfm.policies.normalization import OBSERVATION_CLIP
 from sb3_dtfm.windows import Context
 
 # Of the noise, as in diffusion steering (Wagenmaker et al., 2025).
@@ -41,18 +37,14 @@ class NoiseSpace(spaces.Box):
         return self.np_random.standard_normal(self.shape, np.float32).clip(self.low, self.high)
 
 
-class NoiseActionVecEnv(VecEnvWrapper):
+class NoiseActionVecEnv(FrozenPolicyVecEnv):
     """
     Acts with a frozen DTFM from noise that somebody else chooses: `SAC("MlpPolicy", NoiseActionVecEnv(venv, model))`.
 
     One step is one decision of the frozen policy: with `chunk_size` it carries out `n_action_steps` actions, and rewards
     are added up, without a discount, so that the return of an episode stays what it is. A discount factor counts decisions.
 
-    What is observed is one vector, in the units of the model's training data and clipped at 10: the environment's
-    observation, the return-to-go as the trunk gets it and the time step; with `hidden_state` also the trunk's hidden state,
-    which has seen the steps before.
-
-    The model is left as it is: its weights, the context that its own `predict` remembers, and its random numbers.
+    What is observed, and what happens to the model, see :class:`~sb3_dtfm.finetuning.frozen_env.FrozenPolicyVecEnv`.
 
     :param venv: environments wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
     :param model: a DTFM, or the path to a saved one
@@ -69,83 +61,17 @@ class NoiseActionVecEnv(VecEnvWrapper):
         bound: float = NOISE_BOUND,
         hidden_state: bool = False,
     ) -> None:
-        check_arguments({"bound": bound}, {"bound": POSITIVE})
-        if isinstance(model, str | PathLike):
-            model = DTFM.load(model, device="cpu")  # type: ignore[arg-type]
-        policy = model.policy
+        super().__init__(venv, model, bound, hidden_state)
+
+    @staticmethod
+    def _action_space(policy: SequencePolicy, bound: float) -> spaces.Box:
         noise_dim = policy.check_steerable()
         if not policy.network.head.noise_decides:
             raise ValueError(
                 "n_solver_steps=1: one step of Euler ends at the mean action, from any noise; "
                 f"model.policy.set_acting(n_solver_steps={STEERED_SOLVER_STEPS}) leaves a choice."
             )
-        check_vec_env(venv)
-        model._check_spaces(venv.observation_space, venv.action_space, "The environment has", "the model's are")  # type: ignore[arg-type]
-        n_shown = policy.observation_dim + 2 + (policy.network.trunk.embed_dim if hidden_state else 0)
-        observation_space = spaces.Box(-OBSERVATION_CLIP, OBSERVATION_CLIP, (n_shown,), np.float32)
-        super().__init__(venv, observation_space, NoiseSpace(noise_dim, bound))
-        self.model = model
-        self.bound = float(bound)
-        self.hidden_state = hidden_state
-        self.n_environment_steps = 0
-        self._known: tuple[Context, th.Tensor] | None = None  # each row's newest step, and its hidden state
-        self._acted: Context | None = None
+        return NoiseSpace(noise_dim, bound)
 
-    @property
-    def policy(self) -> SequencePolicy:
-        """The frozen one."""
-        return self.model.policy
-
-    def reset(self) -> VecEnvObs:
-        observations = self.venv.reset()
-        self._known = self.policy.look(observations, episode_start=np.ones(self.num_envs, bool))  # type: ignore[arg-type]
-        return self._show(*self._known)
-
-    def step_async(self, actions: np.ndarray) -> None:
-        """
-        :param actions: noise (B, N)
-        """
-        assert self._known is not None, "reset() comes before step()"
-        chosen, self._acted = self.policy.act_from_noise(*self._known, actions)
-        self.venv.step_async(chosen if self.policy.n_action_steps > 1 else chosen[:, 0])
-
-    def step_wait(self) -> VecEnvStepReturn:
-        observations, rewards, dones, infos = self.venv.step_wait()
-        assert self._acted is not None
-        between = [info.pop(BETWEEN, {}) for info in infos]
-        n_between = [len(each.get(TIMESTEP, ())) for each in between]
-        self.n_environment_steps += self.num_envs + sum(n_between)
-        for row in np.flatnonzero(dones):
-            context = self._pass(Context(*(each[[row]] for each in self._acted)), [between[row]], n_between[row])
-            last = {key: value[None] for key, value in infos[row]["terminal_observation"].items()}
-            infos[row]["terminal_observation"] = self._show(*self.policy.look(last, context))[0]
-        context = self._pass(self._acted, between, self.policy.n_action_steps - 1)
-        self._known = self.policy.look(observations, context, dones)  # type: ignore[arg-type]
-        return self._show(*self._known), rewards, dones, infos
-
-    def _pass(self, context: Context, between: list[dict[str, np.ndarray]], n_steps: int) -> Context:
-        """
-        The context after the planned actions, but for the last observation.
-
-        Rows whose episode ended earlier stay where they were; their context is not needed any more.
-
-        :param context: of b rows that have acted
-        :param between: for each row what was observed between its actions
-        :param n_steps: how often the others observed
-        """
-        newest = {OBSERVATION: context.observations[:, -1].copy(), RETURN_TO_GO: context.returns_to_go[:, -1:].copy()}
-        timestep = context.timesteps[:, -1:]
-        for step in range(n_steps):
-            for row, seen in enumerate(between):
-                for key in newest if step < len(seen[TIMESTEP]) else ():
-                    newest[key][row] = seen[key][step]
-            observation = {**newest, TIMESTEP: timestep + step + 1}
-            _, state = self.policy.predict(observation, tuple(context), np.zeros(len(between), bool))
-            assert state is not None
-            context = Context(*state)
-        return context
-
-    def _show(self, context: Context, hidden: th.Tensor) -> np.ndarray:
-        with th.inference_mode():
-            shown = self.policy.steering_observation(context.windows, hidden if self.hidden_state else None)
-        return shown.cpu().numpy()
+    def _act(self, context: Context, hidden: th.Tensor, actions: np.ndarray) -> tuple[np.ndarray, Context]:
+        return self.policy.act_from_noise(context, hidden, actions)

@@ -10,7 +10,8 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
 from sb3_dtfm.algorithms import DTFM
-from sb3_dtfm.finetuning.noise_env import NoiseActionVecEnv
+from sb3_dtfm.finetuning.correction_env import CorrectionVecEnv
+from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
 from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.policies.steering import ACTIVATIONS
 
@@ -22,14 +23,16 @@ SQUASHED = {"SAC": True, "TQC": True, "PPO": False, "A2C": False, "TRPO": False}
 
 class SteeredDTFM(DTFM):
     """
-    A DTFM whose noise an online algorithm has learned to choose. It acts, is saved, loaded and exported as a DTFM is.
+    A DTFM whose noise an online algorithm has learned to choose, or whose actions it has learned to correct. It acts, is
+    saved, loaded and exported as a DTFM is.
 
-    `deterministic=True` takes what the algorithm's actor makes of the rows of the model's noise table, which is one draw of
+    Of noise `deterministic=True` takes what the algorithm's actor makes of the rows of the model's noise table, which is one draw of
     the actor's distribution that repeats exactly: at first this is what DTFM itself does, and it stays what the algorithm
-    learns from. The actor's mean would begin at zero noise, where arms get stuck.
+    learns from. The actor's mean would begin at zero noise, where arms get stuck. A
+    correction is the actor's mean, at first nearly none.
 
     Without a steering it is the DTFM. It does not learn from data; another steering is learned by
-    `SAC("MlpPolicy", NoiseActionVecEnv(venv, model))`.
+    `SAC("MlpPolicy", NoiseActionVecEnv(venv, model))` or `PPO("MlpPolicy", CorrectionVecEnv(venv, model))`.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -62,10 +65,13 @@ class SteeredDTFM(DTFM):
         """
         Act by an agent's actor as it is now.
 
-        :param agent: SAC, TQC, PPO, A2C or TRPO, whose "MlpPolicy" learns in a :class:`NoiseActionVecEnv`
-        :raises ValueError: another kind of actor
+        :param agent: SAC, TQC, PPO, A2C or TRPO, whose "MlpPolicy" learns in a
+            :class:`~sb3_dtfm.finetuning.NoiseActionVecEnv` or a :class:`~sb3_dtfm.finetuning.CorrectionVecEnv`
+        :raises ValueError: another kind of actor, or corrections of single actions where several are carried out
         """
         settings, weights = _take_over(agent)
+        if settings["corrects"]:
+            self.policy.check_correctable(self.policy.n_action_steps)
         if settings != self.steering or self.policy.steering is None:
             self.policy.set_steering(settings)
             self.steering = settings
@@ -88,7 +94,7 @@ def _take_over(agent: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, th.Tenso
     name = next((each.__name__ for each in type(agent).__mro__ if each.__name__ in SQUASHED), None)
     if name is None:
         _refuse(agent, f"it is a {type(agent).__name__}")
-    env = _noise_env(agent)
+    env = _frozen_env(agent)
     policy: Any = agent.policy
     extractor = policy.actor.features_extractor if SQUASHED[name] else policy.pi_features_extractor
     if type(extractor) is not FlattenExtractor:
@@ -112,6 +118,7 @@ def _take_over(agent: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, th.Tenso
         "squashed": SQUASHED[name],
         "bound": env.bound,
         "hidden_state": env.hidden_state,
+        "corrects": isinstance(env, CorrectionVecEnv),
     }
     weights = {f"layers.{i}.0.{key}": value for i, each in enumerate(linear) for key, value in each.state_dict().items()}
     weights |= {f"mean.{key}": value for key, value in mean.state_dict().items()}
@@ -122,21 +129,21 @@ def _take_over(agent: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, th.Tenso
     return settings, weights
 
 
-def _noise_env(agent: BaseAlgorithm) -> NoiseActionVecEnv:
+def _frozen_env(agent: BaseAlgorithm) -> FrozenPolicyVecEnv:
     """
     The environment that an agent learns in, whose observations it sees as they are.
 
     :raises ValueError: another environment, or something between
     """
     env: Any = agent.get_env()
-    while env is not None and not isinstance(env, NoiseActionVecEnv):
+    while env is not None and not isinstance(env, FrozenPolicyVecEnv):
         if getattr(env, "norm_obs", False):
-            _refuse(agent, "VecNormalize stands between its actor and the noise's environment, which is normalised already")
+            _refuse(agent, "VecNormalize stands between its actor and what it observes, which is normalised already")
         env = getattr(env, "venv", None)
     if env is None:
-        _refuse(agent, "it does not learn in a NoiseActionVecEnv")
+        _refuse(agent, "it does not learn in a NoiseActionVecEnv or CorrectionVecEnv")
     if agent.observation_space.shape != env.observation_space.shape:
-        found = f"{agent.observation_space.shape}, and the NoiseActionVecEnv shows {env.observation_space.shape}"
+        found = f"{agent.observation_space.shape}, and the {type(env).__name__} shows {env.observation_space.shape}"
         _refuse(agent, f"it sees observations of {found}")
     return env
 

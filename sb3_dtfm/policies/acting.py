@@ -1,5 +1,6 @@
 """Acting with the context of the last steps: everything between an observation and an action."""
 
+from functools import partial
 from typing import Any, NoReturn
 
 import numpy as np
@@ -172,7 +173,27 @@ class ActingPolicy(BasePolicy):
         """
         with th.inference_mode():
             chunks = self._to_chunks(self._decode(hidden, th.as_tensor(noise, dtype=th.float32, device=hidden.device)))
-        context = self._carry_out(context, np.ones(len(noise), bool), chunks)
+        return self.carry_out(context, chunks)
+
+    def own_noise(self, context: Context) -> np.ndarray:
+        """
+        The noise that `predict(deterministic=True)` begins with.
+
+        :param context: what :meth:`look` returned
+        :return: (B, N)
+        """
+        return self._acting_noise(context.timesteps[:, -1] + context.episode_keys, deterministic=True).cpu().numpy()
+
+    def carry_out(self, context: Context, chunks: np.ndarray) -> tuple[np.ndarray, Context]:
+        """
+        What comes of actions that somebody else has chosen.
+
+        :param context: what :meth:`look` returned
+        :param chunks: (B, h, A) in [-1, 1], for at least the `n_action_steps` that are carried out
+        :return: as :meth:`act_from_noise`
+        :raises ValueError: they are not finite
+        """
+        context = self._carry_out(context, np.ones(len(chunks), bool), chunks)
         planned = np.concatenate([context.actions[:, -1:], context.plan], axis=1)
         return self._to_environment(planned), context
 
@@ -180,7 +201,7 @@ class ActingPolicy(BasePolicy):
         self, windows: Windows, hidden: th.Tensor | None, rows: np.ndarray | slice = slice(None)
     ) -> th.Tensor:
         """
-        What noise is chosen by, see :func:`~sb3_dtfm.policies.steering.steering_observation`.
+        What a steering chooses by, see :func:`~sb3_dtfm.policies.steering.steering_observation`.
 
         :param windows: arrays (B, K, ...) in the environment's units; the newest step is read
         :param hidden: (b, D), None to leave it out
@@ -201,9 +222,21 @@ class ActingPolicy(BasePolicy):
             raise ValueError(f"{name} of {self.action_space} has no flow whose noise could be chosen; a DTFM is needed.")
         return head.noise_dim
 
+    def check_correctable(self, n_action_steps: int) -> None:
+        """
+        :param n_action_steps: of each plan
+        :raises ValueError: there is no flow, or its actions cannot be corrected one by one
+        """
+        self.check_steerable()
+        if n_action_steps > 1:
+            raise ValueError(
+                f"n_action_steps={n_action_steps}: corrections are of single actions; "
+                "model.policy.set_acting(n_action_steps=1) carries out one of each plan."
+            )
+
     def set_steering(self, settings: dict[str, Any] | None) -> None:
         """
-        Let a network choose the noise from now on; its weights are for the caller to load.
+        Let a network choose the noise, or correct the actions, from now on; its weights are for the caller to load.
 
         :param settings: of :class:`~sb3_dtfm.policies.steering.Steering`; None draws noise again
         :raises ValueError: the head starts from no noise, or a setting out of range
@@ -211,8 +244,8 @@ class ActingPolicy(BasePolicy):
         if settings is None:
             self.steering = None
             return
-        steering = make_steering(self.observation_dim, self.network.trunk.embed_dim, self.check_steerable(), settings)
-        self.steering = steering.to(self.device).requires_grad_(False)
+        sizes = (self.observation_dim, self.network.trunk.embed_dim, self.check_steerable(), self.action_dim)
+        self.steering = make_steering(*sizes, settings).to(self.device).requires_grad_(False)
 
     def reset(self) -> None:
         """Forget the context that `predict` remembers for a caller who passes no `state`."""
@@ -287,10 +320,10 @@ class ActingPolicy(BasePolicy):
             candidates, chosen = self._draw_candidates(hidden, observations, rows, deterministic)
             return self._to_chunks(candidates[th.arange(len(chosen), device=hidden.device), chosen]), keys_values
         noise = self._acting_noise(rows, deterministic).to(hidden.device)
-        if self.steering is not None:
-            shown = self.steering_observation(context.windows, hidden if self.steering.hidden_state else None, due)
-            noise = self.steering(shown, noise)
-        return self._to_chunks(self._decode(hidden, noise)), keys_values
+        if self.steering is None:
+            return self._to_chunks(self._decode(hidden, noise)), keys_values
+        shown = self.steering_observation(context.windows, hidden if self.steering.hidden_state else None, due)
+        return self._to_chunks(self.steering.act(shown, noise, partial(self._decode, hidden))), keys_values
 
     def _hidden(self, context: Context, due: np.ndarray) -> tuple[th.Tensor | None, np.ndarray]:
         """

@@ -96,11 +96,17 @@ class ExportedPolicy(nn.Module):
         else:
             rows = (timesteps[:, -1] + episode_keys) % len(self.noise_table)
             noise = th.where(noise.any(dim=1, keepdim=True), noise, self.noise_table[rows])
-        if self.steering is not None:
+
+        def decode(noise: th.Tensor) -> th.Tensor:
+            return head(hidden, noise).clamp(-1.0, 1.0)
+
+        if self.steering is None:
+            chunk = decode(noise)
+        else:
             newest = Windows(*(each[:, -1:] for each in (observations, scaled, returns_to_go, timesteps, mask)))
             shown = steering_observation(self.normalization, newest, hidden if self.steering.hidden_state else None)
-            noise = self.steering(shown, noise)
-        chunk = head(hidden, noise).clamp(-1.0, 1.0).unflatten(1, (-1, self.settings["action_dim"]))
+            chunk = self.steering.act(shown, noise, decode)
+        chunk = chunk.unflatten(1, (-1, self.settings["action_dim"]))
         return self.normalization.unscale_action(chunk), *kept
 
     def example(self, n_rows: int = 2) -> dict[str, th.Tensor]:

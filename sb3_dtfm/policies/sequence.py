@@ -352,6 +352,8 @@ class SequencePolicy(ActingPolicy):
         settings = {**self.acting_settings(), **settings}
         own = check_arguments(settings, self._acting_rules())
         self._check_candidates(own["n_candidates"])
+        if self.steering is not None and self.steering.corrects:
+            self.check_correctable(own["n_action_steps"])
         heads = self.network.head.check_acting(**{name: settings[name] for name in self.network.head.acting_choices})
         for name, value in own.items():
             setattr(self, name, value)

@@ -1,5 +1,10 @@
-"""Steering: noise that an online algorithm has learned to choose, in place of drawn noise (Wagenmaker et al., 2025)."""
+"""
+Steering: what an online algorithm has learned to choose of how a flow acts.
 
+Its noise, in place of drawn noise (Wagenmaker et al., 2025), or corrections of its actions (Johannink et al., 2019).
+"""
+
+from collections.abc import Callable
 from typing import Any
 
 import torch as th
@@ -20,12 +25,13 @@ ACCEPTED: dict[str, Rule] = {
     "squashed": BOOLEAN,
     "bound": POSITIVE,
     "hidden_state": BOOLEAN,
+    "corrects": BOOLEAN,
 }
 
 
 def steering_observation(normalization: Normalization, newest: Windows, hidden: th.Tensor | None) -> th.Tensor:
     """
-    What noise is chosen by: all that the frozen policy's newest step depends on, but for the steps before it.
+    What a steering chooses by: all that the frozen policy's newest step depends on, but for the steps before it.
 
     Observations are in standard deviations of the training data, without what `calm_units` puts on top: the units that an
     ordinary network learns from, as behind SB3's `VecNormalize`.
@@ -47,28 +53,30 @@ def steering_observation(normalization: Normalization, newest: Windows, hidden: 
 
 class Steering(nn.Module):
     """
-    A Gaussian actor over noise, in a form that holds those of several algorithms.
+    A Gaussian actor over noise, or over corrections, in a form that holds those of several algorithms.
 
-    :param observation_dim: F, numbers of :func:`steering_observation`
-    :param noise_dim: N
+    :param observation_dim: F, what it sees
+    :param chosen_dim: what it chooses: N numbers of noise, or A of an action
     :param layers: widths of the hidden layers
     :param activation: a key of `ACTIVATIONS`
-    :param squashed: noise is bound * tanh(...), as SAC's and TQC's actions; otherwise clipped to the bound, as PPO's
-    :param bound: largest absolute noise
+    :param squashed: it chooses bound * tanh(...), as SAC's and TQC's actions; otherwise clipped to the bound, as PPO's
+    :param bound: largest absolute noise, or correction of actions in [-1, 1]
     :param hidden_state: the trunk's hidden state is part of what it sees
+    :param corrects: it corrects actions, and sees them behind the rest; otherwise it chooses noise
     :raises ValueError: an argument out of range, by name
     """
 
     def __init__(
         self,
         observation_dim: int,
-        noise_dim: int,
+        chosen_dim: int,
         *,
         layers: list[int],
         activation: str,
         squashed: bool,
         bound: float,
         hidden_state: bool,
+        corrects: bool = False,
     ) -> None:
         super().__init__()
         check_arguments(locals(), ACCEPTED)
@@ -77,33 +85,56 @@ class Steering(nn.Module):
         self.squashed = squashed
         self.bound = bound
         self.hidden_state = hidden_state
+        self.corrects = corrects
+        self.chosen_dim = chosen_dim
         widths = [observation_dim, *layers]
         hidden = [nn.Sequential(nn.Linear(*pair), ACTIVATIONS[activation]()) for pair in zip(widths, layers, strict=False)]
         self.layers = nn.Sequential(*hidden)
-        self.mean = nn.Linear(widths[-1], noise_dim)
-        self.log_std = nn.Linear(widths[-1], noise_dim)
+        self.mean = nn.Linear(widths[-1], chosen_dim)
+        self.log_std = nn.Linear(widths[-1], chosen_dim)
 
     def forward(self, observation: th.Tensor, drawn: th.Tensor) -> th.Tensor:
         """
         :param observation: (B, F)
-        :param drawn: (B, N), standard normal
-        :return: noise (B, N), of the actor's distribution
+        :param drawn: (B, N), standard normal; of zeros the mean is chosen
+        :return: what is chosen (B, N), of the actor's distribution
         """
         latent = self.layers(observation)
-        noise = self.mean(latent) + self.log_std(latent).clamp(*LOG_STD_RANGE).exp() * drawn
-        return self.bound * noise.tanh() if self.squashed else noise.clamp(-self.bound, self.bound)
+        chosen = self.mean(latent) + self.log_std(latent).clamp(*LOG_STD_RANGE).exp() * drawn
+        return self.bound * chosen.tanh() if self.squashed else chosen.clamp(-self.bound, self.bound)
+
+    def act(self, observation: th.Tensor, drawn: th.Tensor, decode: Callable[[th.Tensor], th.Tensor]) -> th.Tensor:
+        """
+        Noise is of the actor's distribution, a correction its mean, and of the first action alone: the rest are plans.
+
+        :param observation: (B, F), of :func:`steering_observation`
+        :param drawn: noise (B, N), standard normal
+        :param decode: from noise to actions (B, H A) in [-1, 1]
+        :return: (B, H A) in [-1, 1]
+        """
+        if not self.corrects:
+            return decode(self(observation, drawn))
+        actions = decode(drawn)
+        own, plans = actions[:, : self.chosen_dim], actions[:, self.chosen_dim :]
+        correction = self(th.cat([observation, own], dim=1), th.zeros_like(own))
+        return th.cat([(own + correction).clamp(-1.0, 1.0), plans], dim=1)
 
 
-def make_steering(observation_dim: int, embed_dim: int, noise_dim: int, settings: dict[str, Any]) -> Steering:
+def make_steering(
+    observation_dim: int, embed_dim: int, noise_dim: int, action_dim: int, settings: dict[str, Any]
+) -> Steering:
     """
     :param observation_dim: O, of the environment
     :param embed_dim: D, of the trunk
     :param noise_dim: N, of the head
+    :param action_dim: A
     :param settings: the keyword arguments of :class:`Steering`
     :raises ValueError: others than those, or one out of range
     """
     try:
         sees = observation_dim + 2 + (embed_dim if settings.get("hidden_state") else 0)
+        if settings.get("corrects"):
+            return Steering(sees + action_dim, action_dim, **settings)
         return Steering(sees, noise_dim, **settings)
     except TypeError as error:
         raise ValueError(f"No settings of a steering: {error}.") from error

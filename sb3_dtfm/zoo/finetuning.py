@@ -18,15 +18,15 @@ from sb3_dtfm.algorithms import DTFM
 from sb3_dtfm.arguments import with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.files import read_run
-from sb3_dtfm.finetuning import STEERED, NoiseActionVecEnv, OnlineDTFM, SteeredDTFM
+from sb3_dtfm.finetuning import STEERED, CorrectionVecEnv, NoiseActionVecEnv, OnlineDTFM, SteeredDTFM
 from sb3_dtfm.finetuning.noise_env import STEERED_SOLVER_STEPS
 from sb3_dtfm.finetuning.online import ACCEPTED
 from sb3_dtfm.zoo.arguments import UsageError, asking_for
 from sb3_dtfm.zoo.manager import OF_RL_ZOO, OfflineExperimentManager
 from sb3_dtfm.zoo.resuming import EPISODES, StopSignals
 
-# The key of the settings of a NoiseActionVecEnv in a run's config.yml, where `enjoy` must not find a wrapper.
-NOISE_ENV = "noise_env"
+# What an algorithm may learn in, by the key of its settings in a run's config.yml, where `enjoy` must not find a wrapper.
+FROZEN_ENVS = {"noise_env": NoiseActionVecEnv, "correction_env": CorrectionVecEnv}
 # The online algorithm itself, as Stable-Baselines3 saves it.
 AGENT = "agent"
 # Arguments of an algorithm that the command line gives.
@@ -120,7 +120,7 @@ class FinetuningManager(OfflineExperimentManager):
         if known.get("vec_env_wrapper") and "vec_env_wrapper" not in self.of_the_data:
             raise UsageError(
                 f"--model {self.base}: it learned in {known['vec_env_wrapper']}, where an algorithm that steers needs a "
-                "NoiseActionVecEnv; --algo dtfm goes on in it."
+                "NoiseActionVecEnv or CorrectionVecEnv; --algo dtfm goes on in it."
             )
         from_the_run = ["env_wrapper", *([] if self.env_kwargs else ["env_kwargs"])]  # of the command line, if given there
         from_the_run += self.of_the_data
@@ -136,7 +136,8 @@ class FinetuningManager(OfflineExperimentManager):
 
 class SteeringManager(FinetuningManager):
     """
-    An online algorithm learns in a :class:`~sb3_dtfm.finetuning.NoiseActionVecEnv`.
+    An online algorithm learns in a :class:`~sb3_dtfm.finetuning.NoiseActionVecEnv`, or in a
+    :class:`~sb3_dtfm.finetuning.CorrectionVecEnv`.
 
     What is evaluated and saved is the steered model, in the folder of a run of "steered"; beside it the algorithm itself.
     """
@@ -144,15 +145,6 @@ class SteeringManager(FinetuningManager):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.steered = SteeredDTFM.of(DTFM.load(self.base_file, device=self.device))
-        policy = self.steered.policy
-        if policy.network.head.noise_dim and not policy.network.head.noise_decides:
-            policy.set_acting(n_solver_steps=STEERED_SOLVER_STEPS)
-            print(f"The model acts by one Euler step, which no noise changes: n_solver_steps={STEERED_SOLVER_STEPS} instead")
-        if policy.n_candidates > 1:
-            print(
-                f"The model's critic chooses among {policy.n_candidates} draws; here an algorithm chooses the noise of one"
-            )
-            policy.set_acting(n_candidates=1)
         name = Path(self.save_path).name.removeprefix(f"{self.env_name}_")
         uuid = name.lstrip("0123456789")
         self.log_path = f"{self.log_folder}/{STEERED}/"
@@ -163,28 +155,42 @@ class SteeringManager(FinetuningManager):
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Those of the online algorithm, and of the wrapper that it learns in."""
         hyperparams, _ = super().read_hyperparameters()
-        noise_env = self._noise_env(hyperparams)
-        saved = {key: value for key, value in hyperparams.items() if key != "vec_env_wrapper"}
-        saved[NOISE_ENV] = {**noise_env, "algorithm": self.algo, "model": str(self.base_file)}
-        path = f"{NoiseActionVecEnv.__module__}.{NoiseActionVecEnv.__name__}"
-        hyperparams["vec_env_wrapper"] = [{path: {**noise_env, "model": self.steered}}]
+        key, arguments = self._frozen_env(hyperparams)
+        self._set_acting(corrects=FROZEN_ENVS[key] is CorrectionVecEnv)
+        saved = {name: value for name, value in hyperparams.items() if name != "vec_env_wrapper"}
+        saved[key] = {**arguments, "algorithm": self.algo, "model": str(self.base_file)}
+        path = f"{FROZEN_ENVS[key].__module__}.{FROZEN_ENVS[key].__name__}"
+        hyperparams["vec_env_wrapper"] = [{path: {**arguments, "model": self.steered}}]
         return hyperparams, OrderedDict(sorted(saved.items()))
 
     @staticmethod
-    def _noise_env(hyperparams: dict[str, Any]) -> dict[str, Any]:
+    def _frozen_env(hyperparams: dict[str, Any]) -> tuple[str, dict[str, Any]]:
         """
-        The arguments of the settings' NoiseActionVecEnv.
+        The key in `FROZEN_ENVS` of what the settings name, and its arguments.
 
         :raises UsageError: another wrapper of vectorised environments
         """
-        wrappers = hyperparams.get("vec_env_wrapper") or []
+        wrappers = hyperparams.get("vec_env_wrapper") or [f"{NoiseActionVecEnv.__module__}.{NoiseActionVecEnv.__name__}"]
         wrappers = wrappers if isinstance(wrappers, list) else [wrappers]
-        if not wrappers:
-            return {}
         name, arguments = next(iter(wrappers[0].items())) if isinstance(wrappers[0], dict) else (wrappers[0], {})
-        if len(wrappers) > 1 or not name.endswith(f".{NoiseActionVecEnv.__name__}"):
-            raise UsageError(f"vec_env_wrapper: {wrappers}; expected sb3_dtfm.finetuning.NoiseActionVecEnv alone.")
-        return dict(arguments or {})
+        key = next((key for key, each in FROZEN_ENVS.items() if name.endswith(f".{each.__name__}")), None)
+        if len(wrappers) > 1 or key is None:
+            known = " or ".join(f"sb3_dtfm.finetuning.{each.__name__}" for each in FROZEN_ENVS.values())
+            raise UsageError(f"vec_env_wrapper: {wrappers}; expected {known} alone.")
+        return key, dict(arguments or {})
+
+    def _set_acting(self, corrects: bool) -> None:
+        """Have the model act in a way that leaves an algorithm something to choose."""
+        policy = self.steered.policy
+        if not corrects and policy.network.head.noise_dim and not policy.network.head.noise_decides:
+            policy.set_acting(n_solver_steps=STEERED_SOLVER_STEPS)
+            print(f"The model acts by one Euler step, which no noise changes: n_solver_steps={STEERED_SOLVER_STEPS} instead")
+        if corrects and policy.n_action_steps > 1:
+            print(f"The model carries out {policy.n_action_steps} actions of each plan; here it is one, which is corrected")
+            policy.set_acting(n_action_steps=1)
+        if policy.n_candidates > 1:
+            print(f"The model's critic chooses among {policy.n_candidates} draws; here it acts by one, which is steered")
+            policy.set_acting(n_candidates=1)
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """RL-Zoo's; the steered model is evaluated in the environment itself."""

@@ -60,6 +60,7 @@ def test_a_run_is_finetuned_and_played(run, workplace, capsys):
         "squashed": True,
         "bound": 0.7,
         "hidden_state": False,
+        "corrects": False,
     }
     assert (first.policy.steering.mean.weight != last.policy.steering.mean.weight).any()
     agent = SAC.load(steered / "agent")
@@ -120,7 +121,7 @@ def test_where_noise_is_steered_no_critic_chooses(workplace, capsys):
     assert main(tiny_training("dtfm", "dataset:" + repr(DATASET_ID), *critic)) == 0
     run = workplace / "logs/dtfm/HalfCheetah-v5_1"
     assert main([*FINETUNE, "--model", str(run), "-params", *QUICK, "learning_starts:100"]) == 0
-    assert "The model's critic chooses among 3 draws; here an algorithm chooses the noise of one" in capsys.readouterr().out
+    assert "The model's critic chooses among 3 draws; here it acts by one, which is steered" in capsys.readouterr().out
     steered = SteeredDTFM.load(workplace / "logs/steered/HalfCheetah-v5_1/HalfCheetah-v5")
     assert steered.policy.acting_settings()["n_candidates"] == 1
     config = run / "HalfCheetah-v5" / "config.yml"
@@ -131,7 +132,8 @@ def test_where_noise_is_steered_no_critic_chooses(workplace, capsys):
     assert "it learned in stable_baselines3.common.vec_env.VecMonitor, where" in capsys.readouterr().err
 
 
-def test_ppo_and_a_zip_file_with_a_target_of_its_own(run, workplace):
+def test_ppo_corrects_a_zip_file_with_a_target_of_its_own(run, workplace, capsys):
+    """As gaits are packaged; of the run's chunks one action is carried out, from the beginning of the curve on."""
     quick = ["n_envs:2", "n_steps:8", "batch_size:8", "n_epochs:1", "policy_kwargs:dict(net_arch=[16])"]
     (workplace / "alone.zip").write_bytes((run / "HalfCheetah-v5.zip").read_bytes())
     target = ["--model", "alone.zip", "--algo", "ppo", "--target-return", "3", "--env-kwargs", "max_episode_steps:20"]
@@ -140,6 +142,12 @@ def test_ppo_and_a_zip_file_with_a_target_of_its_own(run, workplace):
     model = SteeredDTFM.load(steered / "HalfCheetah-v5")
     agent = PPO.load(steered / "agent")
     np.testing.assert_array_equal(agent.policy.action_net.weight.detach(), model.policy.steering.mean.weight)
+    assert model.steering["corrects"]
+    assert model.policy.n_action_steps == 1
+    assert "The model carries out 2 actions of each plan; here it is one, which is corrected" in capsys.readouterr().out
+    settings = yaml.unsafe_load((steered / "HalfCheetah-v5/config.yml").read_text())
+    assert settings["correction_env"]["bound"] == 0.5
+    assert main(["enjoy", "--algo", "steered", "--env", "HalfCheetah-v5", "--no-render", "-n", "45", "--load-best"]) == 0
 
 
 def test_a_dtfm_goes_on_from_its_own_episodes(run, workplace, capsys):
@@ -238,7 +246,7 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
         f"--model {run} --algo dtfm -params policy_kwargs:dict(n_candidates=4)": "policy_kwargs: are those of the model",
         f"--model {run} --algo dtfm -params n_candidates:4": "policy_kwargs: are those of the model",
         "--resume logs/dtfm/HalfCheetah-v5_1 --seed 3": "takes no other arguments",
-        f"--model {run} -params {wrong}": "expected sb3_dtfm.finetuning.NoiseActionVecEnv alone.",
+        f"--model {run} -params {wrong}": "expected sb3_dtfm.finetuning.NoiseActionVecEnv or",
         f"--model {run} -params use_sde:True": "its exploration depends on the state (use_sde)",
         f"--model {run} -optimize": "-optimize: hyperparameters of finetune cannot be searched",
     }

@@ -1,0 +1,68 @@
+"""The environment that an online algorithm sees: its actions are corrections of a frozen policy's own."""
+
+from os import PathLike
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+
+from sb3_dtfm.algorithms.offline import OfflineSequenceAlgorithm
+from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
+from sb3_dtfm.policies import SequencePolicy
+from sb3_dtfm.windows import Context
+
+# Of actions between -1 and 1.
+CORRECTION_BOUND = 0.5
+
+
+class CorrectionVecEnv(FrozenPolicyVecEnv):
+    """
+    Acts with a frozen DTFM, and adds what somebody else chooses to its actions: residual reinforcement learning (Johannink
+    et al., 2019; Silver et al., 2018). A choice of zeros is what the DTFM does with `deterministic=True`.
+
+    What is observed, see :class:`~sb3_dtfm.finetuning.frozen_env.FrozenPolicyVecEnv`, and behind it the DTFM's own action,
+    between -1 and 1. Rewards are in units of what the best of the model's training data brought in ten steps on average, so
+    that a discounted value is of the order of ten whatever the task.
+
+    :param venv: environments wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
+    :param model: a DTFM that carries out single actions, or the path to a saved one
+    :param bound: largest correction, of actions between -1 and 1
+    :param hidden_state: show the trunk's hidden state as well
+    :raises ValueError: a policy that is no flow or plans several actions, environments that do not fit it, or an argument
+        out of range
+    """
+
+    def __init__(
+        self,
+        venv: VecEnv,
+        model: OfflineSequenceAlgorithm | str | PathLike[str],
+        bound: float = CORRECTION_BOUND,
+        hidden_state: bool = False,
+    ) -> None:
+        super().__init__(venv, model, bound, hidden_state)
+        normalization = self.policy.normalization
+        self.reward_unit = 10.0 * float(normalization.return_scale) / normalization.max_timestep
+
+    @staticmethod
+    def _action_space(policy: SequencePolicy, bound: float) -> spaces.Box:
+        policy.check_correctable(policy.n_action_steps)
+        return spaces.Box(-bound, bound, (policy.action_dim,), np.float32)
+
+    @staticmethod
+    def _n_shown(policy: SequencePolicy) -> int:
+        return FrozenPolicyVecEnv._n_shown(policy) + policy.action_dim
+
+    def step_wait(self) -> VecEnvStepReturn:
+        observations, rewards, dones, infos = super().step_wait()
+        return observations, rewards / self.reward_unit, dones, infos
+
+    def _show(self, context: Context, hidden: th.Tensor) -> np.ndarray:
+        _, acted = self.policy.act_from_noise(context, hidden, self.policy.own_noise(context))
+        return np.concatenate([super()._show(context, hidden), acted.actions[:, -1]], axis=1)
+
+    def _act(self, context: Context, hidden: th.Tensor, actions: np.ndarray) -> tuple[np.ndarray, Context]:
+        assert self._shown is not None
+        own = self._shown[:, -self.policy.action_dim :]
+        return self.policy.carry_out(context, np.clip(own + actions, -1.0, 1.0)[:, None])
