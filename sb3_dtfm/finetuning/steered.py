@@ -26,10 +26,10 @@ class SteeredDTFM(DTFM):
     A DTFM whose noise an online algorithm has learned to choose, or whose actions it has learned to correct. It acts, is
     saved, loaded and exported as a DTFM is.
 
-    Of noise `deterministic=True` takes what the algorithm's actor makes of the rows of the model's noise table, which is one draw of
-    the actor's distribution that repeats exactly: at first this is what DTFM itself does, and it stays what the algorithm
-    learns from. The actor's mean would begin at zero noise, where arms get stuck. A
-    correction is the actor's mean, at first nearly none.
+    Of noise `deterministic=True` takes what the algorithm's actor makes of the rows of the model's noise table, which is one
+    draw of the actor's distribution that repeats exactly: at first this is what DTFM itself does, and it stays what the
+    algorithm learns from. The actor's mean would begin at zero noise, where arms get stuck. A correction is the actor's
+    mean, whatever `deterministic` is: at first nearly none.
 
     Without a steering it is the DTFM. It does not learn from data; another steering is learned by
     `SAC("MlpPolicy", NoiseActionVecEnv(venv, model))` or `PPO("MlpPolicy", CorrectionVecEnv(venv, model))`.
