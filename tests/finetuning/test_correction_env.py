@@ -16,7 +16,10 @@ ON_POLICY = dict(n_steps=4)
 QUICK = {SAC: OFF_POLICY, PPO: dict(**ON_POLICY, batch_size=4, n_epochs=1), A2C: ON_POLICY}
 
 
-@pytest.fixture(scope="module", params=[{}, {**CHUNKS, "n_action_steps": 1}, {"kv_cache": True}], ids=["", "plans", "cached"])
+CASES = {"single": {}, "plans": {**CHUNKS, "n_action_steps": 1}, "cached": {"kv_cache": True}}
+
+
+@pytest.fixture(scope="module", params=list(CASES.values()), ids=list(CASES))
 def model(request, cheetah_buffer):
     return make_model(DTFM, cheetah_buffer, ema_decay=0.9, policy_kwargs=request.param).learn(5)
 

@@ -1,4 +1,4 @@
-"""That steering learns: of two ways that a flow goes the one that is rewarded, and what to add where its actions fall short."""
+"""That steering learns which of two ways is rewarded, and correcting what to add where actions fall short."""
 
 import gymnasium as gym
 import numpy as np
