@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sb3_dtfm.zoo import commands
 from sb3_dtfm.zoo.arguments import UsageError, resumed_run
-from sb3_dtfm.zoo.registration import ONLINE, finetuning_config, register
+from sb3_dtfm.zoo.registration import finetuning_config, register
 from sb3_dtfm.zoo.resuming import Start
 
 EXAMPLES = """\
@@ -15,8 +15,8 @@ EXAMPLES = """\
   sb3-dtfm finetune --model logs/dtfm/HalfCheetah-v5_1 --env HalfCheetah-v5 --algo ppo -n 1000000
   sb3-dtfm enjoy --algo steered --env robosuite/Lift-v0 --load-best
 """
-# Timesteps between two evaluations: the environments' steps where a DTFM learns itself, decisions where it is steered.
-EVAL_FREQ, USUAL_EVAL_FREQ = {ONLINE: 10_000, "ppo": 100_000}, 1000
+# Of a run, beside the one that it begins with.
+EVALUATIONS_OF_A_RUN = 10
 
 
 def main(argv: Sequence[str]) -> None:
@@ -42,11 +42,11 @@ def main(argv: Sequence[str]) -> None:
     if "-optimize" in rest or "--optimize-hyperparameters" in rest:
         raise UsageError("-optimize: hyperparameters of finetune cannot be searched; -params changes them.")
     config = options.conf_file or finetuning_config(options.algo)
-    usual = EVAL_FREQ.get(options.algo, USUAL_EVAL_FREQ)
-    eval_freq = usual if options.eval_freq is None else options.eval_freq
-    given = ["--algo", options.algo, "--conf-file", str(config), "--eval-freq", str(eval_freq)]
-    arguments = [*given, "--eval-episodes", str(options.eval_episodes), *rest]
-    commands.finetune(arguments, options.model, options.target_return, argv, resumed)
+    given = ["--algo", options.algo, "--conf-file", str(config), "--eval-episodes", str(options.eval_episodes)]
+    if options.eval_freq is not None:
+        given += ["--eval-freq", str(options.eval_freq)]
+    evaluations_of_a_run = EVALUATIONS_OF_A_RUN if options.eval_freq is None else None
+    commands.finetune([*given, *rest], options.model, options.target_return, argv, resumed, evaluations_of_a_run)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -64,13 +64,8 @@ def _parser() -> argparse.ArgumentParser:
     argument("--algo", default="sac", help="dtfm, sac, tqc or ppo, or with a --conf-file a2c or trpo; sac by default")
     argument("--target-return", type=float, help="return to ask for, in reward units; as in the model's run by default")
     argument("-conf", "--conf-file", help="the packaged settings if not given, else a YAML file or a Python package")
-    argument(
-        "--eval-freq",
-        type=int,
-        metavar="N",
-        help=f"timesteps between two evaluations; {USUAL_EVAL_FREQ} decisions by default, "
-        + ", ".join(f"{freq} with {algo}" for algo, freq in EVAL_FREQ.items()),
-    )
+    every = "timesteps between two evaluations; by default a tenth of all: steps with dtfm, else decisions"
+    argument("--eval-freq", type=int, metavar="N", help=every)
     argument("--eval-episodes", type=int, default=20, metavar="N", help="of an evaluation; 20 by default")
     argument("--resume", metavar="RUN", help="go on with an interrupted run of --algo dtfm, as logs/dtfm/HalfCheetah-v5_2")
     return parser

@@ -6,7 +6,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_dtfm.algorithms.offline import OfflineSequenceAlgorithm
 from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
@@ -23,15 +23,15 @@ class CorrectionVecEnv(FrozenPolicyVecEnv):
     et al., 2019; Silver et al., 2018). A choice of zeros is what the DTFM does with `deterministic=True`.
 
     What is observed, see :class:`~sb3_dtfm.finetuning.frozen_env.FrozenPolicyVecEnv`, and behind it the DTFM's own action,
-    between -1 and 1. Rewards are in units of what the best of the model's training data brought in ten steps on average, so
-    that a discounted value is of the order of ten whatever the task.
+    between -1 and 1. Rewards are divided by `reward_unit`, what ten steps bring of the episode with the largest absolute
+    return of the model's training data, so that value functions need no other normalisation.
 
     :param venv: environments wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
-    :param model: a DTFM that carries out single actions, or the path to a saved one
+    :param model: a DTFM that carries out single actions without a critic's choice, or the path to a saved one
     :param bound: largest correction, of actions between -1 and 1
     :param hidden_state: show the trunk's hidden state as well
-    :raises ValueError: a policy that is no flow or plans several actions, environments that do not fit it, or an argument
-        out of range
+    :raises ValueError: a policy that is no flow, carries out several actions of a plan or has its critic choose,
+        environments that do not fit it, or an argument out of range
     """
 
     def __init__(
@@ -48,21 +48,36 @@ class CorrectionVecEnv(FrozenPolicyVecEnv):
     @staticmethod
     def _action_space(policy: SequencePolicy, bound: float) -> spaces.Box:
         policy.check_correctable(policy.n_action_steps)
+        if policy.n_candidates > 1:
+            raise ValueError(
+                f"n_candidates={policy.n_candidates}: corrections are of one draw; model.policy.set_acting(n_candidates=1) "
+                "leaves the critic out."
+            )
         return spaces.Box(-bound, bound, (policy.action_dim,), np.float32)
 
     @staticmethod
     def _n_shown(policy: SequencePolicy) -> int:
         return FrozenPolicyVecEnv._n_shown(policy) + policy.action_dim
 
+    def reset(self) -> VecEnvObs:
+        return self._remember(super().reset())
+
     def step_wait(self) -> VecEnvStepReturn:
         observations, rewards, dones, infos = super().step_wait()
-        return observations, rewards / self.reward_unit, dones, infos
+        return self._remember(observations), rewards / self.reward_unit, dones, infos
+
+    def _remember(self, shown: VecEnvObs) -> VecEnvObs:
+        """Keep the own actions, whatever an algorithm does with what it is shown."""
+        assert isinstance(shown, np.ndarray)
+        self._own = shown[:, -self.policy.action_dim :].copy()
+        return shown
 
     def _show(self, context: Context, hidden: th.Tensor) -> np.ndarray:
         _, acted = self.policy.act_from_noise(context, hidden, self.policy.own_noise(context))
         return np.concatenate([super()._show(context, hidden), acted.actions[:, -1]], axis=1)
 
     def _act(self, context: Context, hidden: th.Tensor, actions: np.ndarray) -> tuple[np.ndarray, Context]:
-        assert self._shown is not None
-        own = self._shown[:, -self.policy.action_dim :]
-        return self.policy.carry_out(context, np.clip(own + actions, -1.0, 1.0)[:, None])
+        if not np.isfinite(actions).all():
+            raise ValueError(f"A correction must be finite numbers, got {actions[~np.isfinite(actions).all(axis=1)][0]}.")
+        corrections = np.clip(actions, -self.bound, self.bound)
+        return self.policy.carry_out(context, np.clip(self._own + corrections, -1.0, 1.0)[:, None])

@@ -54,7 +54,6 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
         self.hidden_state = hidden_state
         self.n_environment_steps = 0
         self._known: tuple[Context, th.Tensor] | None = None  # each row's newest step, and its hidden state
-        self._shown: np.ndarray | None = None
         self._acted: Context | None = None
 
     @staticmethod
@@ -94,8 +93,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
     def reset(self) -> VecEnvObs:
         observations = self.venv.reset()
         self._known = self.policy.look(observations, episode_start=np.ones(self.num_envs, bool))  # type: ignore[arg-type]
-        self._shown = self._show(*self._known)
-        return self._shown
+        return self._show(*self._known)
 
     def step_async(self, actions: np.ndarray) -> None:
         """
@@ -117,8 +115,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
             infos[row]["terminal_observation"] = self._show(*self.policy.look(last, context))[0]
         context = self._pass(self._acted, between, self.policy.n_action_steps - 1)
         self._known = self.policy.look(observations, context, dones)  # type: ignore[arg-type]
-        self._shown = self._show(*self._known)
-        return self._shown, rewards, dones, infos
+        return self._show(*self._known), rewards, dones, infos
 
     def _pass(self, context: Context, between: list[dict[str, np.ndarray]], n_steps: int) -> Context:
         """

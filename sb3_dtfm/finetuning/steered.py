@@ -138,7 +138,7 @@ def _frozen_env(agent: BaseAlgorithm) -> FrozenPolicyVecEnv:
     env: Any = agent.get_env()
     while env is not None and not isinstance(env, FrozenPolicyVecEnv):
         if getattr(env, "norm_obs", False):
-            _refuse(agent, "VecNormalize stands between its actor and what it observes, which is normalised already")
+            _refuse(agent, "VecNormalize stands between its actor and observations that are normalised already")
         env = getattr(env, "venv", None)
     if env is None:
         _refuse(agent, "it does not learn in a NoiseActionVecEnv or CorrectionVecEnv")

@@ -219,7 +219,7 @@ class ActingPolicy(BasePolicy):
         head = self.network.head
         if not head.noise_dim or not isinstance(self.action_space, spaces.Box):
             name = type(self).__name__.removesuffix("Policy")
-            raise ValueError(f"{name} of {self.action_space} has no flow whose noise could be chosen; a DTFM is needed.")
+            raise ValueError(f"{name} of {self.action_space} has no flow that could be steered; a DTFM is needed.")
         return head.noise_dim
 
     def check_correctable(self, n_action_steps: int) -> None:

@@ -53,6 +53,7 @@ def finetune(
     target_return: float | None = None,
     started_with: Sequence[str] = (),
     resumed: Path | None = None,
+    evaluations_of_a_run: int | None = None,
 ) -> None:
     """
     Go on from a DTFM: by :class:`OnlineManager` where it learns itself, else by :class:`SteeringManager`.
@@ -62,11 +63,13 @@ def finetune(
     :param target_return: to ask for; None as in that run
     :param started_with: the command's own arguments
     :param resumed: folder of an interrupted run to go on with
+    :param evaluations_of_a_run: between which a run's timesteps are divided; None where RL-Zoo's arguments say how often
     :raises TrainingError: training failed in its midst
     :raises SystemExit: SIGTERM has ended it, after what there is was saved
     """
     kind = OnlineManager if arguments[list(arguments).index("--algo") + 1] == ONLINE else SteeringManager
-    manager = functools.partial(kind, base=model, target_return=target_return, arguments=list(started_with), resumed=resumed)
+    goes_on = dict(base=model, target_return=target_return, evaluations_of_a_run=evaluations_of_a_run)
+    manager = functools.partial(kind, **goes_on, arguments=list(started_with), resumed=resumed)
     rl_zoo3.train.ExperimentManager = manager  # type: ignore[misc,assignment]
     _call(rl_zoo3.train.train, "finetune", arguments)
 

@@ -1,4 +1,4 @@
-"""RL-Zoo's experiments that go on from a DTFM: an online algorithm steers it, or it learns from its own episodes."""
+"""RL-Zoo's experiments that go on from a DTFM: an online algorithm steers or corrects it, or it learns by itself."""
 
 import inspect
 import os
@@ -101,13 +101,21 @@ class FinetuningManager(OfflineExperimentManager):
 
     :param base: file of the DTFM, or folder of its run
     :param target_return: to ask for; by default as in that run
+    :param evaluations_of_a_run: after equal shares of the timesteps; None where `eval_freq` says how often
     """
 
     of_the_data: tuple[str, ...] = ()  # and other settings of that run that count here, too
 
-    def __init__(self, *args: Any, base: Path, target_return: float | None = None, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        *args: Any,
+        base: Path,
+        target_return: float | None = None,
+        evaluations_of_a_run: int | None = None,
+        **kwargs: Any,
+    ) -> None:
         super().__init__(*args, **kwargs)
-        self.base, self.target_return = base, target_return
+        self.base, self.target_return, self.evaluations_of_a_run = base, target_return, evaluations_of_a_run
         self.base_file = base / f"{self.env_name}.zip" if base.is_dir() else base
         if not self.base_file.is_file():
             raise FileNotFoundError(f"{self.base_file} does not exist; --model names a DTFM's zip file or its run's folder.")
@@ -131,6 +139,9 @@ class FinetuningManager(OfflineExperimentManager):
             hyperparams["env_wrapper"] = asking_for(self.target_return, hyperparams.get("env_wrapper") or [])
         if not hyperparams.get("env_wrapper"):
             raise UsageError(f"--target-return: needed, as {self.base} does not tell what return was asked for.")
+        if self.evaluations_of_a_run is not None:
+            n_timesteps = self.n_timesteps if self.n_timesteps > 0 else hyperparams["n_timesteps"]
+            self.eval_freq = max(int(n_timesteps) // self.evaluations_of_a_run, 1)
         return hyperparams, OrderedDict(sorted(hyperparams.items()))
 
 
@@ -156,7 +167,9 @@ class SteeringManager(FinetuningManager):
         """Those of the online algorithm, and of the wrapper that it learns in."""
         hyperparams, _ = super().read_hyperparameters()
         key, arguments = self._frozen_env(hyperparams)
-        self._set_acting(corrects=FROZEN_ENVS[key] is CorrectionVecEnv)
+        corrects = FROZEN_ENVS[key] is CorrectionVecEnv
+        print(f"{self.algo.upper()} {'corrects the actions' if corrects else 'chooses the noise'} of {self.base}")
+        self._set_acting(corrects)
         saved = {name: value for name, value in hyperparams.items() if name != "vec_env_wrapper"}
         saved[key] = {**arguments, "algorithm": self.algo, "model": str(self.base_file)}
         path = f"{FROZEN_ENVS[key].__module__}.{FROZEN_ENVS[key].__name__}"

@@ -48,7 +48,7 @@ def packaged_config(algo: str, name: str | None = None) -> Path:
 
 def finetuning_config(algo: str) -> Path:
     """
-    Hyperparameter file that comes with the package, of an algorithm that steers.
+    Hyperparameter file that comes with the package, of an algorithm that `finetune` takes.
 
     :param algo: RL-Zoo's name
     :raises ValueError: there is none

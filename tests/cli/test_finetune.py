@@ -132,6 +132,25 @@ def test_where_noise_is_steered_no_critic_chooses(workplace, capsys):
     assert "it learned in stable_baselines3.common.vec_env.VecMonitor, where" in capsys.readouterr().err
 
 
+def test_ten_evaluations_are_made_where_nothing_is_said(run, workplace):
+    command = [
+        "finetune",
+        "--env",
+        "HalfCheetah-v5",
+        "--model",
+        str(run),
+        "-n",
+        "40",
+        "--eval-episodes",
+        "1",
+        "-params",
+        *QUICK,
+    ]
+    assert main(command) == 0
+    evaluations = np.load(workplace / "logs/steered/HalfCheetah-v5_1/evaluations.npz")
+    assert evaluations["timesteps"].tolist() == list(range(0, 41, 4))
+
+
 def test_ppo_corrects_a_zip_file_with_a_target_of_its_own(run, workplace, capsys):
     """As gaits are packaged; of the run's chunks one action is carried out, from the beginning of the curve on."""
     quick = ["n_envs:2", "n_steps:8", "batch_size:8", "n_epochs:1", "policy_kwargs:dict(net_arch=[16])"]
@@ -144,7 +163,9 @@ def test_ppo_corrects_a_zip_file_with_a_target_of_its_own(run, workplace, capsys
     np.testing.assert_array_equal(agent.policy.action_net.weight.detach(), model.policy.steering.mean.weight)
     assert model.steering["corrects"]
     assert model.policy.n_action_steps == 1
-    assert "The model carries out 2 actions of each plan; here it is one, which is corrected" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert "PPO corrects the actions of alone.zip" in output
+    assert "The model carries out 2 actions of each plan; here it is one, which is corrected" in output
     settings = yaml.unsafe_load((steered / "HalfCheetah-v5/config.yml").read_text())
     assert settings["correction_env"]["bound"] == 0.5
     assert main(["enjoy", "--algo", "steered", "--env", "HalfCheetah-v5", "--no-render", "-n", "45", "--load-best"]) == 0

@@ -16,7 +16,8 @@ ON_POLICY = dict(n_steps=4)
 QUICK = {SAC: OFF_POLICY, PPO: dict(**ON_POLICY, batch_size=4, n_epochs=1), A2C: ON_POLICY}
 
 
-CASES = {"single": {}, "plans": {**CHUNKS, "n_action_steps": 1}, "cached": {"kv_cache": True}}
+UNITS = {"average_return_to_go": True, "calm_units": True}
+CASES = {"single": UNITS, "plans": {**CHUNKS, "n_action_steps": 1}, "cached": {"kv_cache": True}}
 
 
 @pytest.fixture(scope="module", params=list(CASES.values()), ids=list(CASES))
@@ -89,9 +90,26 @@ def test_the_last_observation_of_an_episode_has_an_action_of_its_own(model):
     np.testing.assert_allclose(infos[0]["terminal_observation"], shown[0], atol=1e-4)
 
 
+def test_a_reward_is_told_in_what_ten_steps_of_the_largest_return_bring():
+    """In absolute numbers; the longest episode has nine steps."""
+    episodes = [
+        dict(observations=np.random.default_rng(0).normal(size=(9, 17)), actions=np.zeros((9, 6)), rewards=np.full(9, each))
+        for each in (1.0, -100.0)
+    ]
+    env, plain = CorrectionVecEnv(make_venv(), make_model(DTFM, episodes)), make_venv()
+    assert env.reward_unit == pytest.approx(1000.0)
+    env.reset()
+    plain.reset()
+    _, rewards, _, _ = env.step(np.zeros((3, 6)))
+    _, expected, _, _ = plain.step(env._known[0].actions[:, -2])
+    np.testing.assert_allclose(1000.0 * rewards, expected, rtol=1e-4)
+
+
 @pytest.mark.parametrize(("algorithm", "hidden_state"), [(PPO, False), (PPO, True), (A2C, False), (SAC, True)])
 def test_a_corrected_model_plays_what_the_actors_mean_plays_in_the_wrapper(model, algorithm, hidden_state):
     agent = make_agent(model, algorithm, hidden_state).learn(30)
+    if algorithm is not SAC:
+        agent.policy.action_net.bias.data[:2] = th.tensor([1.0, -1.0])  # beyond the bound
     corrected = SteeredDTFM.of(model, agent)
     env = CorrectionVecEnv(make_venv(), model, bound=0.3, hidden_state=hidden_state)
     found = play_corrected(env, lambda shown: agent.predict(shown, deterministic=True)[0])
@@ -134,11 +152,18 @@ def test_what_cannot_be_corrected_is_refused(cheetah_buffer):
         CorrectionVecEnv(make_venv(), chunks)
     with pytest.raises(ValueError, match="bound must be a number above 0, got 0"):
         CorrectionVecEnv(make_venv(), chunks, bound=0)
+    critic = make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=1, n_candidates=4))
+    with pytest.raises(ValueError, match=r"n_candidates=4: corrections are of one draw;.*n_candidates=1\)"):
+        CorrectionVecEnv(make_venv(), critic)
     one_each = SteeredDTFM.of(chunks)
     one_each.policy.set_acting(n_action_steps=1)
     agent = make_agent(one_each)
     with pytest.raises(ValueError, match="corrections are of single actions"):
         SteeredDTFM.of(chunks, agent)
     corrected = SteeredDTFM.of(one_each, agent)
+    env = agent.get_env()
+    env.reset()
+    with pytest.raises(ValueError, match=r"A correction must be finite numbers, got \[nan"):
+        env.step(np.full((3, 6), np.nan))
     with pytest.raises(ValueError, match="corrections are of single actions"):
         corrected.policy.set_acting(n_action_steps=2)

@@ -211,7 +211,7 @@ def test_environment_steps_are_counted():
 
 
 def test_what_cannot_be_steered_is_refused():
-    with pytest.raises(ValueError, match=r"DT of Box.* has no flow whose noise could be chosen; a DTFM is needed"):
+    with pytest.raises(ValueError, match=r"DT of Box.* has no flow that could be steered; a DTFM is needed"):
         NoiseActionVecEnv(make_venv(), _tiny(DT))
     cart = dict(observations=np.zeros((9, 4)), actions=np.array([0, 1] * 4 + [0]), rewards=np.ones(9))
     env = make_vec_env("CartPole-v1", wrapper_class=ReturnToGoWrapper, wrapper_kwargs=dict(target_return=9.0))

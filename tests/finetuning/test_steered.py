@@ -184,24 +184,41 @@ BAD_SETTINGS = [
     ({"bound": -1.0}, "bound must be a number above 0"),
     ({"squashed": 1}, "squashed must be one of True, False"),
     ({"hidden_state": False}, "steering.*shape"),
+    ({"corrects": True}, "steering.*shape"),
+    ({"corrects": 1}, "corrects must be one of True, False"),
     ({"more": 1}, "No settings of a steering"),
 ]
 
 
-@pytest.mark.parametrize(("changed", "message"), BAD_SETTINGS)
-def test_a_file_whose_steering_is_damaged_is_refused(model, agent, tmp_path, changed, message):
+def save_with_other_settings(steered, path, change):
+    """A model's file, of whose steering the settings are changed by a function."""
     file = io.BytesIO()
-    SteeredDTFM.of(model, agent).save(file)
-    with zipfile.ZipFile(file) as archive, zipfile.ZipFile(tmp_path / "damaged.zip", "w") as damaged:
+    steered.save(file)
+    with zipfile.ZipFile(file) as archive, zipfile.ZipFile(path, "w") as changed:
         for name in archive.namelist():
             content = archive.read(name)
             if name == "model.json":
                 configuration = json.loads(content)
-                configuration["attributes"]["steering"].update(changed)
+                change(configuration["attributes"]["steering"])
                 content = json.dumps(configuration).encode()
-            damaged.writestr(name, content)
+            changed.writestr(name, content)
+
+
+@pytest.mark.parametrize(("changed", "message"), BAD_SETTINGS)
+def test_a_file_whose_steering_is_damaged_is_refused(model, agent, tmp_path, changed, message):
+    steered = SteeredDTFM.of(model, agent)
+    save_with_other_settings(steered, tmp_path / "damaged.zip", lambda settings: settings.update(changed))
     with pytest.raises(ModelFileError, match=message):
         SteeredDTFM.load(tmp_path / "damaged.zip")
+
+
+def test_a_file_of_before_there_were_corrections_chooses_noise(model, agent, tmp_path):
+    steered = SteeredDTFM.of(model, agent)
+    save_with_other_settings(steered, tmp_path / "old.zip", lambda settings: settings.pop("corrects"))
+    observations = make_venv().reset()
+    actions, _ = steered.predict(observations, episode_start=np.ones(3, bool), deterministic=True)
+    again, _ = SteeredDTFM.load(tmp_path / "old").predict(observations, episode_start=np.ones(3, bool), deterministic=True)
+    np.testing.assert_array_equal(again, actions)
 
 
 @pytest.mark.slow
