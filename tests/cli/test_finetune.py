@@ -16,6 +16,7 @@ from tests.recorded import DATASET_ID, tiny_training
 
 EVALUATIONS = ["--eval-freq", "10", "--eval-episodes", "2"]
 QUICK = ["n_envs:1", "learning_starts:10", "batch_size:8", "gradient_steps:1", "policy_kwargs:dict(net_arch=[16])"]
+QUICK_PPO = ["n_envs:2", "n_steps:8", "batch_size:8", "n_epochs:1", "policy_kwargs:dict(net_arch=[16])"]
 FINETUNE = ["finetune", "--env", "HalfCheetah-v5", "-n", "24", "--seed", "1", *EVALUATIONS]
 
 
@@ -153,10 +154,9 @@ def test_ten_evaluations_are_made_where_nothing_is_said(run, workplace):
 
 def test_ppo_corrects_a_zip_file_with_a_target_of_its_own(run, workplace, capsys):
     """As gaits are packaged; of the run's chunks one action is carried out, from the beginning of the curve on."""
-    quick = ["n_envs:2", "n_steps:8", "batch_size:8", "n_epochs:1", "policy_kwargs:dict(net_arch=[16])"]
     (workplace / "alone.zip").write_bytes((run / "HalfCheetah-v5.zip").read_bytes())
     target = ["--model", "alone.zip", "--algo", "ppo", "--target-return", "3", "--env-kwargs", "max_episode_steps:20"]
-    assert main([*FINETUNE, *target, "-params", *quick]) == 0
+    assert main([*FINETUNE, *target, "-params", *QUICK_PPO]) == 0
     steered = workplace / "logs/steered/HalfCheetah-v5_1"
     model = SteeredDTFM.load(steered / "HalfCheetah-v5")
     agent = PPO.load(steered / "agent")
@@ -242,13 +242,14 @@ def test_a_run_that_ended_before_its_first_checkpoint_begins_anew(run, workplace
 
 
 @pytest.mark.slow
-def test_the_online_algorithm_goes_on_learning(run, workplace):
-    arguments = ["--model", str(run), "--save-replay-buffer", "-params", *QUICK]
+@pytest.mark.parametrize(("algorithm", "quick"), [(SAC, QUICK), (PPO, QUICK_PPO)])
+def test_the_online_algorithm_goes_on_learning(run, workplace, algorithm, quick):
+    arguments = ["--model", str(run), "--algo", algorithm.__name__.lower(), "--save-replay-buffer", "-params", *quick]
     assert main([*FINETUNE, *arguments]) == 0
     agent = workplace / "logs/steered/HalfCheetah-v5_1/agent.zip"
     assert main([*FINETUNE, *arguments, "-i", str(agent)]) == 0
-    after = SAC.load(workplace / "logs/steered/HalfCheetah-v5_2/agent")
-    assert after._n_updates > SAC.load(agent)._n_updates
+    after = algorithm.load(workplace / "logs/steered/HalfCheetah-v5_2/agent")
+    assert after._n_updates > algorithm.load(agent)._n_updates
 
 
 def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
