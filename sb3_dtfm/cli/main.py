@@ -17,7 +17,7 @@ EXPECTED_ERRORS = (ValueError, TypeError, AssertionError, OSError, ImportError, 
 COMMANDS = {
     "train": "RL-Zoo's `train`, with dt and dtfm.",
     "enjoy": "RL-Zoo's `enjoy`, with dt and dtfm.",
-    "finetune": "Go on learning online: a DTFM by itself, or an algorithm of Stable-Baselines3 that steers or corrects it.",
+    "finetune": "Go on learning online, from a trained DTFM.",
     "inspect": "Show what is in a dataset, and a return to ask for.",
     "record": "Make a dataset from a trained agent or a scripted demonstrator.",
     "demo": "Record, train and evaluate on robosuite's Lift, start to end.",

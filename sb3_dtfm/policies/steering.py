@@ -129,12 +129,15 @@ def make_steering(
     :param noise_dim: N, of the head
     :param action_dim: A
     :param settings: the keyword arguments of :class:`Steering`
+    :return: one whose weights are for the caller to load; PyTorch's global generator, which an algorithm may be learning by,
+        is left as it is
     :raises ValueError: others than those, or one out of range
     """
     try:
         sees = observation_dim + 2 + (embed_dim if settings.get("hidden_state") else 0)
-        if settings.get("corrects"):
-            return Steering(sees + action_dim, action_dim, **settings)
-        return Steering(sees, noise_dim, **settings)
+        with th.random.fork_rng(devices=[]):
+            if settings.get("corrects"):
+                return Steering(sees + action_dim, action_dim, **settings)
+            return Steering(sees, noise_dim, **settings)
     except TypeError as error:
         raise ValueError(f"No settings of a steering: {error}.") from error

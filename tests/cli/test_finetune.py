@@ -152,6 +152,18 @@ def test_ten_evaluations_are_made_where_nothing_is_said(run, workplace):
     assert evaluations["timesteps"].tolist() == list(range(0, 41, 4))
 
 
+@pytest.mark.parametrize(("algorithm", "quick"), [(SAC, QUICK), (PPO, QUICK_PPO)])
+def test_how_often_a_run_is_evaluated_does_not_change_it(run, workplace, algorithm, quick):
+    command = ["finetune", "--env", "HalfCheetah-v5", "--model", str(run), "--algo", algorithm.__name__.lower(), "-n", "48"]
+    actors = []
+    for number, every in ((1, "8"), (2, "-1")):
+        evaluations = ["--eval-freq", every, "--eval-episodes", "1", "--seed", "1"]
+        assert main([*command, *evaluations, "-params", *quick]) == 0
+        actors.append(algorithm.load(workplace / f"logs/steered/HalfCheetah-v5_{number}/agent").policy.state_dict())
+    for name, weights in actors[0].items():
+        np.testing.assert_array_equal(weights, actors[1][name], err_msg=name)
+
+
 def test_ppo_corrects_a_zip_file_with_a_target_of_its_own(run, workplace, capsys):
     """As gaits are packaged; of the run's chunks one action is carried out, from the beginning of the curve on."""
     (workplace / "alone.zip").write_bytes((run / "HalfCheetah-v5.zip").read_bytes())
