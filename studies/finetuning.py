@@ -5,11 +5,13 @@ What fine-tuning brought: runs of `sb3-dtfm finetune` as rows, and their curves.
         --like mine/robosuite-Can-v0_0.05_dtfm_seed0_small.jsonl --label own-episodes --output results/finetuning
     python studies/finetuning.py plot results/finetuning --task HalfCheetah-v5 --labels steered sac sac-with-data \\
         --output docs/studies/finetuning.png
+    python studies/finetuning.py attempts results/attempts --task robosuite/Lift-v0 --output docs/studies/attempts.png
 
 `measure` plays 100 final episodes, as `sb3-dtfm benchmark` does, with the model before (rows of the label "before"), with
 the last one after, and with the best of its evaluations (rows of the label with "-best"), and takes the curve from the run's
 evaluations.npz. Its steps are the environments', its seconds those until then, evaluations included. `--like` is the cell of
-the model before: its rows tell task, data and seed.
+the model before: its rows tell task, data and seed. `attempts` shows models that learned from more or fewer attempts, each
+label so many, by how many steps of the environment these took.
 """
 
 import argparse
@@ -18,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from tqdm import tqdm
@@ -126,18 +129,13 @@ def plot(folder: Path, task: str, labels: list[str], output: Path) -> None:
     :param output: the PNG
     """
     groups = {group.label: group for study in read_studies([folder]) for group in study.groups}
-    figure = Figure(figsize=(6.5, 3.8), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots()
+    figure, axes = new_figure()
     for number, label in enumerate(labels):
         runs = runs_of(groups[label], task)
         steps = [row["step"] for row in runs[0].evaluations]
         values = np.array([[row_value(row) for row in run.evaluations] for run in runs])  # (runs, evaluations)
-        mean, low, high = np.transpose([student_t(column) for column in values.T]).astype(float)
         color = f"C{number}"
-        axes.plot(steps, values.T, color=color, alpha=0.3, linewidth=0.8)
-        axes.fill_between(steps, low, high, color=color, alpha=0.15, linewidth=0)
-        axes.plot(steps, mean, color=color)
+        draw_curve(axes, steps, values, color)
         after = np.mean([row_value(run.final) for run in runs])
         axes.plot(steps[-1], after, "o", color=color, label=f"{label}: {after:,.0f} in the final episodes", clip_on=False)
     began = np.mean([row_value(run.final) for run in runs_of(groups[BEFORE], task)])
@@ -145,6 +143,57 @@ def plot(folder: Path, task: str, labels: list[str], output: Path) -> None:
     axes.set(xlabel="environment steps", ylabel="solved, %, or return")
     axes.legend()
     figure.savefig(output, dpi=110)
+
+
+def plot_attempts(folder: Path, task: str, output: Path) -> None:
+    """
+    Final episodes of the seeds by what was attempted for them, their mean with a 95 % interval (Student's t).
+
+    :param folder: of rows
+    :param task: to show
+    :param output: the PNG
+    """
+    figure, axes = new_figure()
+    draw_curve(axes, *by_attempted_steps(folder, task), "C0", marker="o")
+    axes.set(xlabel="environment steps of all attempts", ylabel="solved, %, or return")
+    figure.savefig(output, dpi=110)
+
+
+def by_attempted_steps(folder: Path, task: str) -> tuple[np.ndarray, np.ndarray]:
+    """
+    :param folder: of rows; each label has learned from so many attempts beside the same demonstrations, one from none
+    :param task: to look at
+    :return: how many steps the attempts have, (N,) from 0 on, and what each seed's final episodes came to, (seeds, N)
+    """
+    groups = [runs_of(group, task) for study in read_studies([folder]) for group in study.groups]
+    found = sorted(filter(None, groups), key=lambda runs: runs[0].final["data"]["n_steps"])
+    if len({tuple(run.cell.seed for run in runs) for runs in found}) != 1:
+        raise SystemExit(f"{folder}: rows of {task} with the same seeds for each label are needed.")
+    steps = np.array([runs[0].final["data"]["n_steps"] for runs in found])
+    return steps - steps[0], np.array([[row_value(run.final) for run in runs] for runs in found]).T
+
+
+def new_figure() -> tuple[Figure, Axes]:
+    """With one field."""
+    figure = Figure(figsize=(6.5, 3.8), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots()
+
+
+def draw_curve(axes: Axes, steps: Any, values: np.ndarray, color: str, marker: str = "") -> None:
+    """
+    Runs, their mean and its 95 % interval.
+
+    :param axes: to draw into
+    :param steps: (N,) increasing
+    :param values: (runs, N)
+    :param color: of all
+    :param marker: of the mean
+    """
+    mean, low, high = np.transpose([student_t(column) for column in values.T]).astype(float)
+    axes.plot(steps, values.T, color=color, alpha=0.3, linewidth=0.8)
+    axes.fill_between(steps, low, high, color=color, alpha=0.15, linewidth=0)
+    axes.plot(steps, mean, marker=marker, color=color)
 
 
 def runs_of(group: Group, task: str) -> list[Run]:
@@ -166,12 +215,18 @@ def main() -> None:
     plotting("--task", required=True)
     plotting("--labels", nargs="+", required=True)
     plotting("--output", type=Path, required=True)
+    attempting = commands.add_parser("attempts").add_argument
+    attempting("folder", type=Path)
+    attempting("--task", required=True)
+    attempting("--output", type=Path, required=True)
     options = parser.parse_args()
     if options.command == "plot":
         plot(options.folder, options.task, options.labels, options.output)
-        return
-    options.output.mkdir(parents=True, exist_ok=True)
-    measure(options.run, options.before, read_rows(options.like)[-1], options.label, options.output)
+    elif options.command == "attempts":
+        plot_attempts(options.folder, options.task, options.output)
+    else:
+        options.output.mkdir(parents=True, exist_ok=True)
+        measure(options.run, options.before, read_rows(options.like)[-1], options.label, options.output)
 
 
 if __name__ == "__main__":
