@@ -147,7 +147,7 @@ def plot(folder: Path, task: str, labels: list[str], output: Path) -> None:
 
 def plot_attempts(folder: Path, task: str, output: Path) -> None:
     """
-    Final episodes of the seeds by what was attempted for them, their mean with a 95 % interval (Student's t).
+    Share of final episodes that the seeds solve by what was attempted for them, its mean with a 95 % interval (Student's t).
 
     :param folder: of rows
     :param task: to show
@@ -155,7 +155,8 @@ def plot_attempts(folder: Path, task: str, output: Path) -> None:
     """
     figure, axes = new_figure()
     draw_curve(axes, *by_attempted_steps(folder, task), "C0", marker="o")
-    axes.set(xlabel="environment steps of all attempts", ylabel="solved, %, or return")
+    axes.set(xlabel="environment steps of all attempts", ylabel="solved, %")
+    axes.set_ylim(top=100)
     figure.savefig(output, dpi=110)
 
 
