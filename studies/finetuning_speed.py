@@ -1,9 +1,10 @@
 """
-How many steps a second an environment makes alone, and behind `NoiseActionVecEnv`; and where the time goes.
+Steps a second that environments make alone, and behind what `sb3-dtfm finetune` puts around them; and where the time goes.
 
-    OMP_NUM_THREADS=1 python studies/finetuning_speed.py --env robosuite/Lift-v0 HalfCheetah-v5 --n-envs 1 2 -o rows.jsonl
+    OMP_NUM_THREADS=1 python studies/finetuning_speed.py --env robosuite/Lift-v0 --n-envs 1 2 --vec-env subproc -o rows.jsonl
 
-One thread for each process, environments of more than one in `SubprocVecEnv`. The model has the small profile's sizes and no
+`attempts` are those that a DTFM makes to learn from them, `wrapped` chooses at random what an algorithm would, `learning` is
+the algorithm itself with its packaged settings. One thread for each process. The model has the small profile's sizes and no
 training: what it computes is the same.
 """
 
@@ -19,23 +20,27 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 import yaml
-from stable_baselines3 import SAC
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_dtfm import DTFM
 from sb3_dtfm.benchmark.provenance import commit, hardware, versions
 from sb3_dtfm.envs import ReturnToGoWrapper
-from sb3_dtfm.finetuning import NoiseActionVecEnv
+from sb3_dtfm.finetuning import CorrectionVecEnv, NoiseActionVecEnv
+from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
+from sb3_dtfm.finetuning.noise_env import STEERED_SOLVER_STEPS
 from sb3_dtfm.zoo.registration import finetuning_config, packaged_config
 
 # Beside those of the trunk and the head, what the settings of a task say about a model.
 OF_THE_MODEL = ("context_length", "ema_decay", "policy_kwargs")
+VEC_ENVS: dict[str, type[VecEnv]] = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}
+WAYS = {"sac": (SAC, NoiseActionVecEnv), "ppo": (PPO, CorrectionVecEnv)}
 
 
-def settings_of(env_id: str) -> dict[str, Any]:
-    """Of the small profile."""
-    settings = yaml.safe_load(packaged_config("dtfm", "small").read_text())
+def settings_of(path: Path, env_id: str) -> dict[str, Any]:
+    """Of a task, in a packaged file."""
+    settings = yaml.safe_load(path.read_text())
     return settings.get(env_id, settings["default"])
 
 
@@ -48,16 +53,15 @@ def make_model(env_id: str) -> DTFM:
     actions = rng.uniform(env.action_space.low, env.action_space.high, (20, *env.action_space.shape))
     episodes = [dict(observations=rng.normal(size=sizes), actions=actions, rewards=np.ones(20)) for _ in range(2)]
     env.close()
-    settings = {name: value for name, value in settings_of(env_id).items() if name in OF_THE_MODEL}
+    settings = settings_of(packaged_config("dtfm", "small"), env_id)
+    settings = {name: value for name, value in settings.items() if name in OF_THE_MODEL}
     return DTFM("MultiInputPolicy", dataset=episodes, seed=0, device="cpu", **settings)
 
 
-def make_envs(env_id: str, n_envs: int) -> VecEnv:
+def make_envs(env_id: str, n_envs: int, vec_env: str) -> VecEnv:
     """As `sb3-dtfm finetune` makes them."""
     wrapper = functools.partial(ReturnToGoWrapper, target_return=1.0)
-    return make_vec_env(
-        env_id, n_envs, seed=0, wrapper_class=wrapper, vec_env_cls=DummyVecEnv if n_envs == 1 else SubprocVecEnv
-    )
+    return make_vec_env(env_id, n_envs, seed=0, wrapper_class=wrapper, vec_env_cls=VEC_ENVS[vec_env])
 
 
 def steps_per_second(step: Callable[[], int], seconds: float) -> float:
@@ -94,82 +98,127 @@ class Timed:
 
         return timed
 
+    def shares(self, wall: float) -> dict[str, Any]:
+        """:param wall: seconds of all"""
+        return {"shares": {part: round(each / wall, 3) for part, each in self.seconds.items()}}
 
-def measure(env_id: str, n_envs: int, seconds: float) -> Iterator[dict[str, Any]]:
-    """Rows: the bare environments, behind the wrapper with random noise, and with SAC that learns."""
-    model = make_model(env_id)
-    about = {"task": env_id, "n_envs": n_envs, "n_action_steps": model.policy.n_action_steps}
 
-    bare = make_envs(env_id, n_envs)
-    bare.reset()
+def measure(env_id: str, n_envs: int, vec_env: str, algos: list[str], seconds: float) -> Iterator[dict[str, Any]]:
+    """Rows: environments alone, attempts of a DTFM, and for each algorithm what it learns in, and itself."""
+    about = {"task": env_id, "n_envs": n_envs, "vec_env": vec_env}
+    envs = make_envs(env_id, n_envs, vec_env)
+    envs.reset()
     rng = np.random.default_rng(0)
-    low, high = bare.action_space.low, bare.action_space.high
+    low, high = envs.action_space.low, envs.action_space.high
 
     def step_bare() -> int:
-        bare.step(rng.uniform(low, high, (n_envs, len(low))).astype(np.float32))
+        envs.step(rng.uniform(low, high, (n_envs, len(low))).astype(np.float32))
         return n_envs
 
-    alone = steps_per_second(step_bare, seconds)
-    bare.close()
-    yield {**about, "what": "bare", "steps_per_s": round(alone, 1)}
+    yield {**about, "what": "bare", "steps_per_s": round(steps_per_second(step_bare, seconds), 1)}
+    model = make_model(env_id)
+    timed = Timed({"environment": (envs, "step_wait"), "model": (model, "predict")})
+    acting = Acting(model, envs)
+    start = time.perf_counter()
+    found = steps_per_second(acting.step, seconds)
+    yield {**about, "what": "attempts", "steps_per_s": round(found, 1), **timed.shares(time.perf_counter() - start)}
+    envs.close()
+    for algo in algos:
+        yield from ({**about, "algo": algo, **row} for row in measure_algorithm(algo, env_id, n_envs, vec_env, seconds))
 
-    wrapped = NoiseActionVecEnv(make_envs(env_id, n_envs), model)
-    wrapped.reset()
 
-    def step_wrapped() -> int:
-        before = wrapped.n_environment_steps
-        wrapped.step(np.array([wrapped.action_space.sample() for _ in range(n_envs)]))
-        return wrapped.n_environment_steps - before
+class Acting:
+    """A model that makes attempts, as it does to learn from them."""
+
+    def __init__(self, model: DTFM, envs: VecEnv) -> None:
+        self.model, self.envs = model, envs
+        self.observations, self.state, self.starts = envs.reset(), None, np.ones(envs.num_envs, bool)
+
+    def step(self) -> int:
+        """:return: environment steps"""
+        actions, self.state = self.model.predict(self.observations, self.state, self.starts)
+        self.observations, _, self.starts, _ = self.envs.step(actions)
+        return self.envs.num_envs
+
+
+def measure_algorithm(algo: str, env_id: str, n_envs: int, vec_env: str, seconds: float) -> Iterator[dict[str, Any]]:
+    """Rows of one algorithm."""
+    algorithm_class, wrapper_class = WAYS[algo]
+    settings = settings_of(finetuning_config(algo), env_id)
+    ((path, arguments),) = settings["vec_env_wrapper"][0].items()
+    if not path.endswith(wrapper_class.__name__):
+        raise SystemExit(f"--algo {algo} --env {env_id}: packaged settings name {path}, not {wrapper_class.__name__}.")
+    for what in ("wrapped", "learning"):
+        model = make_model(env_id)
+        if wrapper_class is CorrectionVecEnv:
+            model.policy.set_acting(n_action_steps=1)
+        elif not model.policy.network.head.noise_decides:
+            model.policy.set_acting(n_solver_steps=STEERED_SOLVER_STEPS)
+        envs: FrozenPolicyVecEnv = wrapper_class(make_envs(env_id, n_envs, vec_env), model, **arguments)
+        row = {"what": what, "n_action_steps": model.policy.n_action_steps}
+        if what == "wrapped":
+            yield {**row, **measure_wrapped(envs, seconds)}
+        else:
+            yield {**row, **measure_learning(algorithm_class, settings, envs, seconds)}
+        envs.close()
+
+
+def measure_wrapped(envs: FrozenPolicyVecEnv, seconds: float) -> dict[str, Any]:
+    """Random choices."""
+    envs.reset()
+
+    def step() -> int:
+        before = envs.n_environment_steps
+        envs.step(np.array([envs.action_space.sample() for _ in range(envs.num_envs)]))
+        return envs.n_environment_steps - before
 
     timed = Timed(
         {
-            "environment": (wrapped.venv, "step_wait"),
-            "environment, asked": (wrapped.venv, "step_async"),
-            "trunk and context": (model.policy, "look"),
-            "head": (model.policy, "act_from_noise"),
-            "steps of a chunk": (wrapped, "_pass"),
+            "environment": (envs.venv, "step_wait"),
+            "trunk and context": (envs.policy, "look"),
+            "head": (envs.policy, "act_from_noise"),
+            "steps of a chunk": (envs, "_pass"),
         }
     )
     start = time.perf_counter()
-    found = steps_per_second(step_wrapped, seconds)
-    yield {**about, "what": "wrapped", "steps_per_s": round(found, 1), **_shares(timed.seconds, time.perf_counter() - start)}
-    wrapped.close()
+    found = steps_per_second(step, seconds)
+    return {"steps_per_s": round(found, 1), **timed.shares(time.perf_counter() - start)}
 
-    settings = yaml.safe_load(finetuning_config("sac").read_text())["default"]
-    for name in ("n_timesteps", "n_envs", "vec_env_wrapper", "learning_starts"):
-        settings.pop(name)
-    learning = NoiseActionVecEnv(make_envs(env_id, n_envs), model)
-    agent = SAC(env=learning, device="cpu", seed=0, learning_starts=n_envs, **settings)
-    timed = Timed({"environment and policy": (learning, "step"), "gradient steps": (agent, "train")})
+
+def measure_learning(
+    algorithm_class: type[PPO] | type[SAC], settings: dict[str, Any], envs: FrozenPolicyVecEnv, seconds: float
+) -> dict[str, Any]:
+    """An algorithm; off-policy ones learn from the first step on."""
+    settings = {name: value for name, value in settings.items() if name not in ("n_timesteps", "n_envs", "vec_env_wrapper")}
+    if "learning_starts" in settings:
+        settings["learning_starts"] = envs.num_envs
+    agent = algorithm_class(env=envs, device="cpu", seed=0, **settings)
+    timed = Timed({"environment": (envs.venv, "step_wait"), "wrapper": (envs, "step"), "gradient steps": (agent, "train")})
     start = time.perf_counter()
     agent.learn(10**9, callback=lambda *_: time.perf_counter() - start < seconds)
     wall = time.perf_counter() - start
-    found = learning.n_environment_steps / wall
-    yield {**about, "what": "sac", "steps_per_s": round(found, 1), **_shares(timed.seconds, wall)}
-    learning.close()
-
-
-def _shares(seconds: dict[str, float], wall: float) -> dict[str, Any]:
-    return {"shares": {part: round(each / wall, 3) for part, each in seconds.items()}}
+    timed.seconds["wrapper"] -= timed.seconds["environment"]
+    return {"steps_per_s": round(envs.n_environment_steps / wall, 1), **timed.shares(wall)}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", nargs="+", default=["robosuite/Lift-v0", "HalfCheetah-v5"], metavar="TASK")
-    parser.add_argument("--n-envs", nargs="+", type=int, default=[1, 2], metavar="N")
+    parser.add_argument("--env", default="robosuite/Lift-v0", metavar="TASK")
+    parser.add_argument("--algo", nargs="+", choices=WAYS, default=["sac"], help="what learns; sac by default")
+    parser.add_argument("--n-envs", nargs="+", type=int, default=[1], metavar="N")
+    parser.add_argument("--vec-env", choices=VEC_ENVS, default="dummy")
     parser.add_argument("--seconds", type=float, default=20.0, help="of each measurement")
-    parser.add_argument("-o", "--output", type=Path, help="JSONL file to write")
+    parser.add_argument("-o", "--output", type=Path, help="JSONL file to append to")
     options = parser.parse_args()
     th.set_num_threads(1)
     origin = {"commit": commit(), "versions": versions(), "hardware": hardware(th.device("cpu"))}
-    rows = []
-    for env_id in options.env:
-        for n_envs in options.n_envs:
-            for row in measure(env_id, n_envs, options.seconds):
-                rows.append({**row, **origin})
-                print(json.dumps(row), flush=True)
-    if options.output:
-        options.output.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    for n_envs in options.n_envs:
+        for row in measure(options.env, n_envs, options.vec_env, options.algo, options.seconds):
+            line = json.dumps({**row, **origin})
+            print(line, flush=True)
+            if options.output:
+                with options.output.open("a") as file:
+                    file.write(line + "\n")
 
 
 if __name__ == "__main__":
