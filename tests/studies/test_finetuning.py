@@ -27,6 +27,12 @@ def test_a_run_is_measured_and_shown(workplace):
     run = workplace / "logs/dtfm/HalfCheetah-v5_2"
     shutil.copy(before / "HalfCheetah-v5.zip", run / "best_model.zip")  # one that is known not to be the last
     finetuning.measure(run, before, like, "own", workplace / "rows")
+    (workplace / "longer").mkdir()
+    finetuning.measure(run, before, like, "own", workplace / "longer", {"max_episode_steps": 22})
+    (*_, longer) = read_rows(workplace / "longer" / f"{cell._replace(label='own').file_name}.jsonl")
+    assert longer["lengths"] == [22] * 100
+    assert longer["settings"]["env_kwargs"] == {"max_episode_steps": 20}
+    assert longer["settings"]["eval_env_kwargs"] == {"max_episode_steps": 22}
     (study,) = read_studies([workplace / "rows"])
     runs = {group.label: next(iter(group.runs.values()))[0] for group in study.groups}
     before, after, best = (runs[label] for label in ("before", "own", "own-best"))
@@ -41,6 +47,7 @@ def test_a_run_is_measured_and_shown(workplace):
     assert before.final["lengths"] == after.final["lengths"] == [20] * 100
     assert before.final["returns"] != after.final["returns"]
     assert after.final["settings"]["gradient_steps"] == 2
+    assert after.final["settings"]["policy_kwargs"]["embed_dim"] == 16  # of the model before
     rows = read_rows(workplace / "rows" / f"{cell._replace(label='own').file_name}.jsonl")
     seconds = np.array([row["wall_s"] for row in rows])
     assert seconds[0] == 0.0
