@@ -171,10 +171,11 @@ def parse_only(command: Callable[[], Any]) -> None:
 
 
 def check_hyperparameters(options: argparse.Namespace) -> None:
-    """Those of `train -params`; the command itself learns of unknown ones when it makes the model."""
+    """Those of `train -params`, the policy's among them; the command learns of unknown ones when it makes the model."""
     algorithm = ALGORITHMS.get(getattr(options, "algo", None) or "")
     if algorithm is not None and isinstance(getattr(options, "hyperparams", None), dict):
-        check_settings(algorithm, options.hyperparams)
+        of_the_policy = algorithm.policy_aliases["MultiInputPolicy"].parameter_names()
+        check_settings(algorithm, {key: value for key, value in options.hyperparams.items() if key not in of_the_policy})
 
 
 def check_settings(algorithm: type, settings: dict[str, Any]) -> None:
