@@ -103,8 +103,8 @@ class Timed:
         return {"shares": {part: round(each / wall, 3) for part, each in self.seconds.items()}}
 
 
-def measure(env_id: str, n_envs: int, vec_env: str, algos: list[str], seconds: float) -> Iterator[dict[str, Any]]:
-    """Rows: environments alone, attempts of a DTFM, and for each algorithm what it learns in, and itself."""
+def measure(env_id: str, n_envs: int, vec_env: str, algo: str, seconds: float) -> Iterator[dict[str, Any]]:
+    """Rows: environments alone, attempts of a DTFM, what an algorithm learns in, and itself."""
     about = {"task": env_id, "n_envs": n_envs, "vec_env": vec_env}
     envs = make_envs(env_id, n_envs, vec_env)
     envs.reset()
@@ -123,8 +123,7 @@ def measure(env_id: str, n_envs: int, vec_env: str, algos: list[str], seconds: f
     found = steps_per_second(acting.step, seconds)
     yield {**about, "what": "attempts", "steps_per_s": round(found, 1), **timed.shares(time.perf_counter() - start)}
     envs.close()
-    for algo in algos:
-        yield from ({**about, "algo": algo, **row} for row in measure_algorithm(algo, env_id, n_envs, vec_env, seconds))
+    yield from ({**about, "algo": algo, **row} for row in measure_algorithm(algo, env_id, n_envs, vec_env, seconds))
 
 
 class Acting:
@@ -204,7 +203,7 @@ def measure_learning(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default="robosuite/Lift-v0", metavar="TASK")
-    parser.add_argument("--algo", nargs="+", choices=WAYS, default=["sac"], help="what learns; sac by default")
+    parser.add_argument("--algo", choices=WAYS, default="sac", help="what learns; sac by default")
     parser.add_argument("--n-envs", nargs="+", type=int, default=[1], metavar="N")
     parser.add_argument("--vec-env", choices=VEC_ENVS, default="dummy")
     parser.add_argument("--seconds", type=float, default=20.0, help="of each measurement")
