@@ -10,9 +10,9 @@ What fine-tuning brought: runs of `sb3-dtfm finetune` as rows, and their curves.
 `measure` plays 100 final episodes, as `sb3-dtfm benchmark` does, with the model before (rows of the label "before"), with
 the last one after, and with the best of its evaluations (rows of the label with "-best"), and takes the curve from the run's
 evaluations.npz. Its steps are the environments', its seconds those until then, evaluations included. `--like` is the cell of
-the model before: its rows tell task, data and seed. `--env-kwargs` are those of final episodes, where the run learned in
-others. `attempts` shows models that learned from more or fewer attempts, each
-label so many, by how many steps of the environment these took.
+the model before: its rows tell task, data and seed. Final episodes are played in the environments of the run's evaluations.
+`attempts` shows models that learned from more or fewer attempts, each label so many, by how many steps of the environment
+these took.
 """
 
 import argparse
@@ -34,13 +34,12 @@ from sb3_dtfm.benchmark.rows import Cell, Row, read_rows, write_row
 from sb3_dtfm.files import read_run
 from sb3_dtfm.finetuning import STEERED
 from sb3_dtfm.recording.loading import load_agent
-from sb3_dtfm.zoo.arguments import key_values
 
 N_EPISODES, N_ENVS = 100, 10
 BEFORE = "before"
 
 
-def measure(run: Path, before: Path, like: Row, label: str, output: Path, env_kwargs: dict[str, Any] | None = None) -> None:
+def measure(run: Path, before: Path, like: Row, label: str, output: Path) -> None:
     """
     Write rows of what a run began with, and of what it came to.
 
@@ -49,16 +48,13 @@ def measure(run: Path, before: Path, like: Row, label: str, output: Path, env_kw
     :param like: a row of the model before
     :param label: of the rows
     :param output: folder for the files
-    :param env_kwargs: of the final episodes, those of the run by default
     """
     (folder,) = (path.parent for path in run.glob("*/config.yml"))
     if run.parent.name == STEERED and load_agent(STEERED, run / f"{folder.name}.zip", "cpu").policy.n_action_steps > 1:
         raise SystemExit(f"{run}: its timesteps are decisions of several actions; rows have the environment's steps.")
     settings = {**like["settings"], **read_run(before / folder.name), **read_run(folder)}
     settings.pop("callback", None)
-    if env_kwargs:
-        settings["eval_env_kwargs"] = env_kwargs
-    envs = make_seeded_envs(like["task"], {**settings, "env_kwargs": env_kwargs or settings["env_kwargs"]}, N_ENVS)
+    envs = make_seeded_envs(like["task"], {**settings, "env_kwargs": settings["eval_env_kwargs"]}, N_ENVS)
     times = environment_steps(run)
     evaluations = curve(run)
     with np.load(run / "evaluations.npz") as saved:
@@ -218,7 +214,6 @@ def main() -> None:
     measuring("--like", type=Path, required=True)
     measuring("--label", required=True)
     measuring("--output", type=Path, required=True)
-    measuring("--env-kwargs", nargs="+")
     plotting = commands.add_parser("plot").add_argument
     plotting("folder", type=Path)
     plotting("--task", required=True)
@@ -235,8 +230,7 @@ def main() -> None:
         plot_attempts(options.folder, options.task, options.output)
     else:
         options.output.mkdir(parents=True, exist_ok=True)
-        like, env_kwargs = read_rows(options.like)[-1], key_values("--env-kwargs", options.env_kwargs or [])
-        measure(options.run, options.before, like, options.label, options.output, env_kwargs)
+        measure(options.run, options.before, read_rows(options.like)[-1], options.label, options.output)
 
 
 if __name__ == "__main__":

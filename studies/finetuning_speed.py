@@ -29,7 +29,7 @@ from sb3_dtfm.benchmark.provenance import commit, hardware, versions
 from sb3_dtfm.envs import ReturnToGoWrapper
 from sb3_dtfm.finetuning import CorrectionVecEnv, NoiseActionVecEnv
 from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
-from sb3_dtfm.finetuning.noise_env import STEERED_SOLVER_STEPS
+from sb3_dtfm.zoo.finetuning import leave_a_choice
 from sb3_dtfm.zoo.registration import finetuning_config, packaged_config
 
 # Beside those of the trunk and the head, what the settings of a task say about a model.
@@ -149,10 +149,7 @@ def measure_algorithm(algo: str, env_id: str, n_envs: int, vec_env: str, seconds
         raise SystemExit(f"--algo {algo} --env {env_id}: packaged settings name {path}, not {wrapper_class.__name__}.")
     for what in ("wrapped", "learning"):
         model = make_model(env_id)
-        if wrapper_class is CorrectionVecEnv:
-            model.policy.set_acting(n_action_steps=1)
-        elif not model.policy.network.head.noise_decides:
-            model.policy.set_acting(n_solver_steps=STEERED_SOLVER_STEPS)
+        leave_a_choice(model.policy, wrapper_class is CorrectionVecEnv)
         envs: FrozenPolicyVecEnv = wrapper_class(make_envs(env_id, n_envs, vec_env), model, **arguments)
         row = {"what": what, "n_action_steps": model.policy.n_action_steps}
         if what == "wrapped":

@@ -6,7 +6,8 @@ from typing import Any
 
 def read_run(run: Path) -> dict[str, Any]:
     """
-    A run's hyperparameters; its `env_kwargs` are those of the command line, before those of the YAML file.
+    A run's hyperparameters; its `env_kwargs` are those of the command line, before those of the YAML file, and its
+    `eval_env_kwargs` those of its evaluations.
 
     The files are read as RL-Zoo reads them, by a loader that can run code: name runs that you trust.
 
@@ -21,4 +22,5 @@ def read_run(run: Path) -> dict[str, Any]:
     hyperparams, _ = get_saved_hyperparams(str(run))
     arguments = run / "args.yml"
     given = yaml.load(arguments.read_text(), Loader=yaml.UnsafeLoader) if arguments.is_file() else {}
-    return {**hyperparams, "env_kwargs": given.get("env_kwargs") or hyperparams.get("env_kwargs") or {}}
+    env_kwargs = given.get("env_kwargs") or hyperparams.get("env_kwargs") or {}
+    return {**hyperparams, "env_kwargs": env_kwargs, "eval_env_kwargs": given.get("eval_env_kwargs") or env_kwargs}

@@ -21,6 +21,7 @@ from sb3_dtfm.files import read_run
 from sb3_dtfm.finetuning import STEERED, CorrectionVecEnv, NoiseActionVecEnv, OnlineDTFM, SteeredDTFM
 from sb3_dtfm.finetuning.noise_env import STEERED_SOLVER_STEPS
 from sb3_dtfm.finetuning.online import ACCEPTED
+from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.zoo.arguments import UsageError, asking_for
 from sb3_dtfm.zoo.manager import OF_RL_ZOO, OfflineExperimentManager
 from sb3_dtfm.zoo.resuming import EPISODES, StopSignals
@@ -93,6 +94,24 @@ class SteeredCallbacks(BaseCallback):
 def has_learned(agent: BaseAlgorithm) -> bool:
     """Whether an algorithm has done a gradient step."""
     return getattr(agent, "_n_updates", 0) > 0
+
+
+def leave_a_choice(policy: SequencePolicy, corrects: bool) -> None:
+    """
+    Have a model act in a way that leaves an algorithm something to choose.
+
+    :param policy: of the model
+    :param corrects: its actions are corrected, and its noise is not chosen
+    """
+    if not corrects and policy.network.head.noise_dim and not policy.network.head.noise_decides:
+        policy.set_acting(n_solver_steps=STEERED_SOLVER_STEPS)
+        print(f"The model acts by one Euler step, which no noise changes: n_solver_steps={STEERED_SOLVER_STEPS} instead")
+    if corrects and policy.n_action_steps > 1:
+        print(f"The model carries out {policy.n_action_steps} actions of each plan; here it is one, which is corrected")
+        policy.set_acting(n_action_steps=1)
+    if policy.n_candidates > 1:
+        print(f"The model's critic chooses among {policy.n_candidates} draws; here it acts by one, which is steered")
+        policy.set_acting(n_candidates=1)
 
 
 class FinetuningManager(OfflineExperimentManager):
@@ -169,7 +188,7 @@ class SteeringManager(FinetuningManager):
         key, arguments = self._frozen_env(hyperparams)
         corrects = FROZEN_ENVS[key] is CorrectionVecEnv
         print(f"{self.algo.upper()} {'corrects the actions' if corrects else 'chooses the noise'} of {self.base}")
-        self._set_acting(corrects)
+        leave_a_choice(self.steered.policy, corrects)
         saved = {name: value for name, value in hyperparams.items() if name != "vec_env_wrapper"}
         saved[key] = {**arguments, "algorithm": self.algo, "model": str(self.base_file)}
         path = f"{FROZEN_ENVS[key].__module__}.{FROZEN_ENVS[key].__name__}"
@@ -191,19 +210,6 @@ class SteeringManager(FinetuningManager):
             known = " or ".join(f"sb3_dtfm.finetuning.{each.__name__}" for each in FROZEN_ENVS.values())
             raise UsageError(f"vec_env_wrapper: {wrappers}; expected {known} alone.")
         return key, dict(arguments or {})
-
-    def _set_acting(self, corrects: bool) -> None:
-        """Have the model act in a way that leaves an algorithm something to choose."""
-        policy = self.steered.policy
-        if not corrects and policy.network.head.noise_dim and not policy.network.head.noise_decides:
-            policy.set_acting(n_solver_steps=STEERED_SOLVER_STEPS)
-            print(f"The model acts by one Euler step, which no noise changes: n_solver_steps={STEERED_SOLVER_STEPS} instead")
-        if corrects and policy.n_action_steps > 1:
-            print(f"The model carries out {policy.n_action_steps} actions of each plan; here it is one, which is corrected")
-            policy.set_acting(n_action_steps=1)
-        if policy.n_candidates > 1:
-            print(f"The model's critic chooses among {policy.n_candidates} draws; here it acts by one, which is steered")
-            policy.set_acting(n_candidates=1)
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """RL-Zoo's; the steered model is evaluated in the environment itself."""
