@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.utils import set_random_seed
 
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.envs import ReturnToGoWrapper
@@ -27,6 +28,12 @@ def one_thread():
     Before any other fixture: another number of threads adds up in another order, to other bits.
     """
     th.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def same_random_numbers():
+    """Every run of a test draws the same, also where it names no seed."""
+    set_random_seed(0)
 
 
 def make_env(seed: int | None = None) -> gym.Env:

@@ -25,7 +25,7 @@ def minari_folder(tmp_path_factory) -> Path:
     """Minari's folder with DATASET_ID in it, recorded through the command line."""
     folder = tmp_path_factory.mktemp("minari")
     model = folder / "agent.zip"
-    PPO("MlpPolicy", "HalfCheetah-v5", n_steps=8, batch_size=8, device="cpu").save(model)
+    PPO("MlpPolicy", "HalfCheetah-v5", n_steps=8, batch_size=8, device="cpu", seed=0).save(model)
     record = ["record", "--algo", "ppo", "--model", str(model), "--env", "HalfCheetah-v5", "--dataset-id", DATASET_ID]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MINARI_DATASETS_PATH", str(folder))

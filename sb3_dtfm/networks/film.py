@@ -13,6 +13,8 @@ TAU_FREQUENCIES = (1.0, 100.0)
 # Higher ones tell the episodes of one agent apart, and each is then learned for itself.
 RETURN_FREQUENCIES = (1.0, 8.0)
 RETURN_EMBEDDING_DIM = 16
+# Data are at about 1. The factors of ten blocks multiply: of a return of 100 they would leave the range of float32.
+RETURN_CLIP = 10.0
 
 
 def sinusoidal_embedding(
@@ -107,6 +109,7 @@ class ReturnFilm(nn.Module):
         nn.init.zeros_(self.output.bias)
 
     def forward(self, returns_to_go: th.Tensor) -> th.Tensor:
-        """From (B, N), scaled, to (B, N, 2 * embed_dim * n_blocks)."""
+        """From (B, N), scaled and clipped at 10, to (B, N, 2 * embed_dim * n_blocks)."""
+        returns_to_go = returns_to_go.clamp(-RETURN_CLIP, RETURN_CLIP)
         waves = sinusoidal_embedding(returns_to_go, RETURN_EMBEDDING_DIM, RETURN_FREQUENCIES)
         return self.output(F.silu(self.hidden(th.cat((returns_to_go.unsqueeze(-1), waves), dim=-1))))

@@ -51,6 +51,7 @@ class OfflineExperimentManager(ExperimentManager):
 
     def __init__(self, *args: Any, arguments: Sequence[str] = (), resumed: Path | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        self.valueless: list[str] = []  # why trials of a search have no value
         self.signals = StopSignals(between_steps=self.algo in ALGORITHMS)
         self.keeper: KeepCheckpoint | None = None
         # RL-Zoo draws a seed where none is given; the last one that is given counts.
@@ -99,8 +100,23 @@ class OfflineExperimentManager(ExperimentManager):
         """RL-Zoo's, of a search; a trial that diverges or needs too much memory is one without a value."""
         try:
             return super().objective(trial)
-        except (FloatingPointError, MemoryError) as error:
-            raise optuna.TrialPruned(str(error)) from error
+        except (FloatingPointError, MemoryError, optuna.TrialPruned) as error:
+            cause = error.__cause__ or error
+            self.valueless.append(f"{type(cause).__name__}: {cause}".removesuffix(": "))
+            raise optuna.TrialPruned(str(cause)) from error
+
+    def hyperparameters_optimization(self) -> None:
+        """
+        RL-Zoo's.
+
+        :raises UsageError: no trial has a value, so none is the best, and why the last one has none
+        """
+        try:
+            super().hyperparameters_optimization()
+        except ValueError as error:  # Optuna's, of a study without a best trial
+            if not self.valueless:
+                raise
+            raise UsageError(f"{error} Of {len(self.valueless)} the last ended by {self.valueless[-1]}") from error
 
     def create_callbacks(self) -> None:
         """RL-Zoo's, and the evaluations that a count of full intervals leaves out."""

@@ -102,6 +102,14 @@ def test_causal_mask_by_hand():
     assert allowed.tolist() == [[True, False, False], [False, True, False], [False, True, True]]
 
 
+def test_a_return_far_beyond_the_data_leaves_ten_blocks_finite():
+    th.manual_seed(0)
+    trunk = SequenceTrunk(OBSERVATION_DIM, A, max_timestep=K, embed_dim=256, film_return_to_go=True)
+    asked = th.full((1, K), 1e3)  # as much as a policy passes on
+    rest = th.randn(1, K, OBSERVATION_DIM), th.zeros(1, K, A)
+    assert trunk(*rest, asked, th.arange(K).view(1, K), th.ones(1, K, dtype=th.bool)).isfinite().all()
+
+
 def test_time_steps_beyond_the_longest_share_the_last_embedding(trunk, window):
     late, later = dict(window), dict(window)
     late["timesteps"] = th.full_like(window["timesteps"], 49)

@@ -14,6 +14,7 @@ from sb3_dtfm.zoo.registration import packaged_config, with_policy_options
 from tests.recorded import DATASET_ID, tiny_training
 
 ENV = ["--env", "Ant-v5"]
+SEARCH = ["-n", "2", "-optimize", "--n-trials", "2", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots"]
 
 
 def zoo_reads(arguments: list[str]) -> argparse.Namespace:
@@ -161,6 +162,14 @@ def test_a_trial_that_diverges_does_not_end_a_search(workplace, monkeypatch, cap
         return learn(self, *args, **kwargs)
 
     monkeypatch.setattr(DT, "learn", diverge)
-    search = ["-n", "2", "-optimize", "--n-trials", "2", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots"]
-    assert main(tiny_training("dt", "--dataset", DATASET_ID, *search)) == 0
+    assert main(tiny_training("dt", "--dataset", DATASET_ID, "--seed", "1", *SEARCH)) == 0
     assert "Number of finished trials:  2" in capfd.readouterr().out
+
+
+def test_a_search_of_which_no_trial_ends_says_so(workplace, monkeypatch, capfd):
+    def diverge(self, *args, **kwargs):
+        raise FloatingPointError("on purpose")
+
+    monkeypatch.setattr(DT, "learn", diverge)
+    assert main(tiny_training("dt", "--dataset", DATASET_ID, *SEARCH)) == 2
+    assert "No trials are completed yet. Of 2 the last ended by FloatingPointError: on purpose" in capfd.readouterr().err
