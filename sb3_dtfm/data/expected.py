@@ -12,7 +12,7 @@ HIDDEN_DIM = 256
 N_TIMESTEPS, BATCH_SIZE, LEARNING_RATE, WEIGHT_DECAY = 3000, 256, 1e-3, 1e-2
 N_AT_ONCE = 8192
 # 0.5 would be the mean, and near 1 the luckiest: what noise spoiled often, a model that leaves it out does often.
-EXPECTILE = 0.9
+EXPECTILE = 0.95
 # Standard deviations at which observations are clipped, and what is smaller than this is a constant.
 CLIP, SMALLEST_STD = 10.0, 1e-6
 
