@@ -21,7 +21,7 @@ def buffer() -> TrajectoryBuffer:
     """
     All begin at 0. Half go by 1 and earn one a step; half go by -1 and earn at the last step: eight one time in ten.
 
-    So they reach 6 for sure, and e by the expectile: 0.95 of a tenth of 8 - e is 0.05 of nine tenths of e, so e = 0.76 / 0.14.
+    So they reach 6 for sure, and e by the expectile: 0.95 of a tenth of 8 - e is 0.05 of nine tenths of e: 0.76 / 0.14.
     """
     episodes = []
     for i in range(N_EPISODES):
