@@ -5,14 +5,14 @@ What fine-tuning brought: runs of `sb3-dtfm finetune` as rows, and their curves.
         --like mine/robosuite-Can-v0_0.05_dtfm_seed0_small.jsonl --label own-episodes --output results/finetuning
     python studies/finetuning.py plot results/finetuning --task HalfCheetah-v5 --labels steered sac sac-with-data \\
         --output docs/studies/finetuning.png
-    python studies/finetuning.py attempts results/attempts --task robosuite/Lift-v0 --output docs/studies/attempts.png
+    python studies/finetuning.py attempts results/attempts --output docs/studies/attempts.png
 
 `measure` plays 100 final episodes, as `sb3-dtfm benchmark` does, with the model before (rows of the label "before"), with
 the last one after, and with the best of its evaluations (rows of the label with "-best"), and takes the curve from the run's
 evaluations.npz. Its steps are the environments', its seconds those until then, evaluations included. `--like` is the cell of
 the model before: its rows tell task, data and seed. Final episodes are played in the environments of the run's evaluations.
 `attempts` shows models that learned from more or fewer attempts, each label so many, by how many steps of the environment
-these took.
+these took, each task beside the others.
 """
 
 import argparse
@@ -130,7 +130,7 @@ def plot(folder: Path, task: str, labels: list[str], output: Path) -> None:
     :param output: the PNG
     """
     groups = {group.label: group for study in read_studies([folder]) for group in study.groups}
-    figure, axes = new_figure()
+    figure, (axes,) = new_figure()
     for number, label in enumerate(labels):
         runs = runs_of(groups[label], task)
         steps = [row["step"] for row in runs[0].evaluations]
@@ -148,19 +148,20 @@ def plot(folder: Path, task: str, labels: list[str], output: Path) -> None:
     figure.savefig(output, dpi=110)
 
 
-def plot_attempts(folder: Path, task: str, output: Path) -> None:
+def plot_attempts(folder: Path) -> Figure:
     """
     Share of final episodes that the seeds solve by what was attempted for them, its mean with a 95 % interval (Student's t).
 
-    :param folder: of rows
-    :param task: to show
-    :param output: the PNG
+    :param folder: of rows, whose tasks are shown side by side
     """
-    figure, axes = new_figure()
-    draw_curve(axes, *by_attempted_steps(folder, task), "C0", marker="o")
-    axes.set(xlabel="environment steps of all attempts", ylabel="solved, %")
-    axes.set_ylim(top=100)
-    figure.savefig(output, dpi=110)
+    tasks = sorted({task for study in read_studies([folder]) for group in study.groups for task, _, _ in group.runs})
+    figure, fields = new_figure(len(tasks))
+    for axes, task in zip(fields, tasks, strict=True):
+        draw_curve(axes, *by_attempted_steps(folder, task), "C0", marker="o")
+        axes.set(title=task, xlabel="environment steps of all attempts")
+        axes.set_ylim(top=100)
+    fields[0].set_ylabel("solved, %")
+    return figure
 
 
 def by_attempted_steps(folder: Path, task: str) -> tuple[np.ndarray, np.ndarray]:
@@ -177,11 +178,11 @@ def by_attempted_steps(folder: Path, task: str) -> tuple[np.ndarray, np.ndarray]
     return steps - steps[0], np.array([[row_value(run.final) for run in runs] for runs in found]).T
 
 
-def new_figure() -> tuple[Figure, Axes]:
-    """With one field."""
-    figure = Figure(figsize=(6.5, 3.8), layout="constrained")
+def new_figure(n: int = 1) -> tuple[Figure, list[Axes]]:
+    """With `n` fields side by side."""
+    figure = Figure(figsize=(2.9 + 3.6 * n, 3.8), layout="constrained")
     FigureCanvasAgg(figure)
-    return figure, figure.subplots()
+    return figure, list(figure.subplots(1, n, squeeze=False)[0])
 
 
 def draw_curve(axes: Axes, steps: Any, values: np.ndarray, color: str, marker: str = "") -> None:
@@ -221,13 +222,12 @@ def main() -> None:
     plotting("--output", type=Path, required=True)
     attempting = commands.add_parser("attempts").add_argument
     attempting("folder", type=Path)
-    attempting("--task", required=True)
     attempting("--output", type=Path, required=True)
     options = parser.parse_args()
     if options.command == "plot":
         plot(options.folder, options.task, options.labels, options.output)
     elif options.command == "attempts":
-        plot_attempts(options.folder, options.task, options.output)
+        plot_attempts(options.folder).savefig(options.output, dpi=110)
     else:
         options.output.mkdir(parents=True, exist_ok=True)
         measure(options.run, options.before, read_rows(options.like)[-1], options.label, options.output)
