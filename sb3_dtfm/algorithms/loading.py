@@ -96,7 +96,10 @@ def from_file(
         )
     model = algorithm(attributes["policy_class"], device=device, _init_setup_model=False)
     if attributes.get("steering") is not None and not hasattr(model, "steering"):
-        raise ModelFileError(f"{source} is a DTFM with its steering; sb3_dtfm.finetuning.SteeredDTFM loads it.")
+        raise ModelFileError(
+            f"{source} is a DTFM with its steering: sb3_dtfm.finetuning.SteeredDTFM loads it. To go on learning, `sb3-dtfm "
+            "finetune -i` takes the agent.zip beside it, and --model the DTFM that it began with."
+        )
     vars(model).update(attributes)
     with naming_the_file(source):
         check_sizes(model, tensors[POLICY], source)

@@ -31,7 +31,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
     :param model: a DTFM, or the path to a saved one
     :param bound: how far the choice may go
     :param hidden_state: show the trunk's hidden state as well
-    :raises ValueError: a model or environments that do not fit, or an argument out of range
+    :raises ValueError: a model that is steered already, one or environments that do not fit, or an argument out of range
     """
 
     def __init__(
@@ -44,6 +44,8 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
         check_arguments({"bound": bound}, {"bound": POSITIVE})
         if isinstance(model, str | PathLike):
             model = DTFM.load(model, device="cpu")  # type: ignore[arg-type]
+        if model.policy.steering is not None:
+            raise ValueError(f"This {type(model).__name__} is steered already; take the DTFM that it was made of.")
         action_space = self._action_space(model.policy, float(bound))
         check_vec_env(venv)
         model._check_spaces(venv.observation_space, venv.action_space, "The environment has", "the model's are")  # type: ignore[arg-type]

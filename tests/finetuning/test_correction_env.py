@@ -6,7 +6,7 @@ import torch as th
 from stable_baselines3 import A2C, PPO, SAC
 
 from sb3_dtfm import DT, DTFM
-from sb3_dtfm.finetuning import CorrectionVecEnv, SteeredDTFM
+from sb3_dtfm.finetuning import CorrectionVecEnv, NoiseActionVecEnv, SteeredDTFM
 from sb3_dtfm.policies.exported import ExportedPolicy
 from tests.algorithms.small import make_model
 from tests.finetuning.test_noise_env import CHUNKS, make_venv
@@ -161,6 +161,9 @@ def test_what_cannot_be_corrected_is_refused(cheetah_buffer):
     with pytest.raises(ValueError, match="corrections are of single actions"):
         SteeredDTFM.of(chunks, agent)
     corrected = SteeredDTFM.of(one_each, agent)
+    for wrapper in (CorrectionVecEnv, NoiseActionVecEnv):
+        with pytest.raises(ValueError, match="This SteeredDTFM is steered already"):
+            wrapper(make_venv(), corrected)
     env = agent.get_env()
     env.reset()
     with pytest.raises(ValueError, match=r"A correction must be finite numbers, got \[nan"):

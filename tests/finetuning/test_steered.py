@@ -101,7 +101,7 @@ def test_a_file_holds_both_and_nothing_that_is_run(model, agent, tmp_path):
             np.testing.assert_array_equal(ours, theirs)
     names = zipfile.ZipFile(tmp_path / "steered.zip").namelist()
     assert not [name for name in names if name.endswith((".pth", ".pkl", "data"))]
-    with pytest.raises(ModelFileError, match="SteeredDTFM loads it"):
+    with pytest.raises(ModelFileError, match=r"SteeredDTFM loads it\. To go on .* --model the DTFM that it began with"):
         DTFM.load(tmp_path / "steered")
 
 
