@@ -127,6 +127,11 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         )
         parallel = DataParallel(self.policy, self._loss_function(), self.batch_size)
         self._training_seed = parallel.from_first(self._choose_training_seed())
+        if self.verbose >= 1 and is_first_process():
+            n_steps = total_timesteps - self.num_timesteps
+            epochs = n_steps * self.batch_size / len(buffer)
+            sizes = f"{n_steps:,} gradient steps of {self.batch_size} windows"
+            print(f"{sizes}: {epochs:.1f} epochs of {len(buffer):,} recorded steps", flush=True)
         batches = self._batches(buffer, self.batch_size)
         callback.on_training_start(locals(), globals())
         parallel.from_first(True)  # which may evaluate for longer than a gradient step's messages wait
