@@ -59,7 +59,7 @@ class OnlineDTFM(DTFM):
 
     :param n_episodes: own episodes between two times of learning, of all environments together
     :param gradient_steps: each of these times, over which `learning_rate_schedule` and `warmup_steps` go
-    :ivar own: all own episodes, None before the first ones
+    :ivar replay_buffer: all own episodes, None before the first ones
     """
 
     progress_bar_class = ProgressBarCallback
@@ -67,7 +67,7 @@ class OnlineDTFM(DTFM):
     def __init__(self, *args: Any, n_episodes: int = 10, gradient_steps: int = 100, **kwargs: Any) -> None:
         self.n_episodes = n_episodes
         self.gradient_steps = gradient_steps
-        self.own: TrajectoryBuffer | None = None
+        self.replay_buffer: TrajectoryBuffer | None = None
         self._running: list[Step] = []  # of the episodes that have not ended
         self._began: list[int] = []  # where each environment's episode begins in them
         self._state: tuple[np.ndarray, ...] | None = None  # of acting
@@ -80,7 +80,7 @@ class OnlineDTFM(DTFM):
 
     def _excluded_save_params(self) -> list[str]:
         """Also what is kept in a file of its own, or belongs to the environments."""
-        return [*super()._excluded_save_params(), "own", "_running", "_began", "_state"]
+        return [*super()._excluded_save_params(), "replay_buffer", "_running", "_began", "_state"]
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         """SB3's own, for the environments count here."""
@@ -132,7 +132,7 @@ class OnlineDTFM(DTFM):
         parallel = DataParallel(self.policy, self._loss_function(), self.batch_size)
         self._training_seed = self._choose_training_seed()
         callback.on_training_start(locals(), globals())
-        if self._n_left and self.own is not None:  # of a turn that was interrupted
+        if self._n_left and self.replay_buffer is not None:  # of a turn that was interrupted
             self._imitate(parallel, min(self._n_left, self.gradient_steps))
         n_turns = 0
         while self.num_timesteps < total_timesteps:
@@ -204,9 +204,9 @@ class OnlineDTFM(DTFM):
         assert self.buffer is not None
         known = (self.action_space, self.buffer.observation_space)
         new = TrajectoryBuffer.from_trajectories(episodes, *known, source="own episodes", env_id=self.buffer.env_id)
-        if self.own is not None:
-            new = TrajectoryBuffer.join([self.own, new], [1.0, 1.0])
-        self.own = new.to(self.device)
+        if self.replay_buffer is not None:
+            new = TrajectoryBuffer.join([self.replay_buffer, new], [1.0, 1.0])
+        self.replay_buffer = new.to(self.device)
 
     def save_replay_buffer(self, path: str | PathLike[str]) -> None:
         """
@@ -216,9 +216,9 @@ class OnlineDTFM(DTFM):
         :raises ValueError: there are none yet
         :raises OSError: it cannot be written
         """
-        if self.own is None:
+        if self.replay_buffer is None:
             raise ValueError("There are no own episodes to save yet.")
-        self.own.save(path)
+        self.replay_buffer.save(path)
 
     def load_replay_buffer(self, path: str | PathLike[str], truncate_last_traj: bool = True) -> None:
         """
@@ -231,7 +231,7 @@ class OnlineDTFM(DTFM):
         path = with_npz(path)
         own = load_dataset(path, action_space=self.action_space)
         self._check_spaces(return_to_go_space(own.observation_space), own.action_space, f"{path} holds", "the model's are")
-        self.own = own.to(self.device)
+        self.replay_buffer = own.to(self.device)
 
     def _imitate(self, parallel: DataParallel, n_steps: int) -> None:
         """
@@ -251,11 +251,11 @@ class OnlineDTFM(DTFM):
     def _imitated(self) -> Iterator[Windows]:
         """Batches of the dataset and of the own episodes that are worth it."""
         assert self.buffer is not None
-        assert self.own is not None
-        average = np.concatenate([self.buffer.episode_returns, self.own.episode_returns]).mean()
-        successes, returns = self.own.successes, self.own.episode_returns
+        assert self.replay_buffer is not None
+        average = np.concatenate([self.buffer.episode_returns, self.replay_buffer.episode_returns]).mean()
+        successes, returns = self.replay_buffer.successes, self.replay_buffer.episode_returns
         worthy = np.flatnonzero(np.where(np.isnan(successes), returns >= average, successes == 1.0))
-        imitated = self.own.select(worthy) if len(worthy) else None
+        imitated = self.replay_buffer.select(worthy) if len(worthy) else None
         if imitated is not None and self.return_steps is not None:
             imitated = imitated.to("cpu").with_expected_returns(self.return_steps, self.dataset_seed).to(self.device)
         n_own = self._n_own(imitated, self.batch_size) if imitated is not None else 0
@@ -272,10 +272,10 @@ class OnlineDTFM(DTFM):
 
     def _sample_transitions(self, batch_size: int, generator: th.Generator) -> Transitions:
         """Of all episodes, so many own ones as are imitated."""
-        if self.own is None:
+        if self.replay_buffer is None:
             return super()._sample_transitions(batch_size, generator)
-        n_own = self._n_own(self.own, batch_size)
-        own = self.own.sample_transitions(n_own, self.policy.n_valued, self.policy.gamma, generator)
+        n_own = self._n_own(self.replay_buffer, batch_size)
+        own = self.replay_buffer.sample_transitions(n_own, self.policy.n_valued, self.policy.gamma, generator)
         if n_own == batch_size:
             return own
         others = super()._sample_transitions(batch_size - n_own, generator)

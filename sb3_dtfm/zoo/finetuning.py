@@ -335,6 +335,6 @@ class OnlineManager(FinetuningManager):
         :raises SystemExit: SIGTERM has ended the run
         """
         assert isinstance(model, OnlineDTFM)
-        if model.own is not None:
+        if model.replay_buffer is not None:
             model.save_replay_buffer(os.path.join(self.save_path, EPISODES))
         super().save_trained_model(model)

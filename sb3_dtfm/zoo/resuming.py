@@ -164,7 +164,7 @@ class KeepCheckpoint(BaseCallback):
 
     def save(self) -> None:
         """Save the model as it is, and its own episodes if it has any."""
-        if isinstance(self.model, OnlineDTFM) and self.model.own is not None:
+        if isinstance(self.model, OnlineDTFM) and self.model.replay_buffer is not None:
             self.model.save_replay_buffer(self.path.with_name(EPISODES))
         self.model.save(self.path)
         self._saved_at = time.monotonic()

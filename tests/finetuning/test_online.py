@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecNormalize
@@ -60,7 +60,7 @@ def test_own_episodes_are_kept_as_they_were(model):
     model.learn(90, watch)
     assert model.num_timesteps % 3 == 0
     assert 90 <= model.num_timesteps < 90 + 3 * 10
-    own = model.own
+    own = model.replay_buffer
     assert own.episode_lengths[:4].tolist() == [4, 7, 4, 10]
     assert own.terminated.tolist() == [length == 10 for length in own.episode_lengths]
     assert own.truncated.tolist() == [length != 10 for length in own.episode_lengths]
@@ -80,9 +80,10 @@ def test_learning_repeats_and_is_logged_and_a_callback_ends_it(file, cheetah_buf
         th.testing.assert_close(ours, theirs, rtol=0, atol=0)
     assert models[0]._n_updates > 5
     assert {"rollout/ep_rew_mean", "rollout/ep_len_mean", "rollout/success_rate", "train/loss"} <= curves.points.keys()
-    n_before = models[0].own.n_episodes
+    n_before = models[0].replay_buffer.n_episodes
     assert models[0].learn(60, Watch(n_steps=7)).num_timesteps == 21
-    assert models[0].own.n_episodes == n_before + 2, "those that had ended, one after four steps and one after seven"
+    n_ended = models[0].replay_buffer.n_episodes - n_before
+    assert n_ended == 2, "those that had ended, one after four steps and one after seven"
 
 
 def episodes(returns, successes, first=100.0):
@@ -107,7 +108,7 @@ def test_so_many_steps_are_of_own_episodes_that_succeeded(model, successes, wort
     """
     model.set_dataset(episodes([0.0] * 6, [None] * 6, first=0.0))
     model._training_seed = 0
-    model.own = episodes([-1e3, 1e3, -1e3, 1e3], successes)
+    model.replay_buffer = episodes([-1e3, 1e3, -1e3, 1e3], successes)
     _, *batches = zip(range(20), model._imitated(), strict=False)
     present = {round(float(each) - 100) for _, batch in batches for each in batch.observations[:, -1, 0] if each > 50}
     n_own = {int((batch.observations[:, -1, 0] > 50).sum()) for _, batch in batches}
@@ -124,7 +125,8 @@ def test_what_it_saves_is_a_dtfm(model, tmp_path, cheetah_buffer):
         loaded = cls.load(tmp_path / "online.zip", device="cpu")
         actions, _ = loaded.predict(observations, deterministic=True, episode_start=np.ones(3, bool))
         np.testing.assert_array_equal(actions, expected)
-    assert OnlineDTFM.load(tmp_path / "online.zip", make_venv(), dataset=cheetah_buffer, **ONLINE).learn(30).own is not None
+    goes_on = OnlineDTFM.load(tmp_path / "online.zip", make_venv(), dataset=cheetah_buffer, **ONLINE)
+    assert goes_on.learn(30).replay_buffer is not None
 
 
 def test_what_a_turn_is_stays_in_its_file(model, tmp_path, cheetah_buffer):
@@ -145,24 +147,27 @@ def test_the_seed_is_the_environments_too(file, cheetah_buffer):
 def test_own_returns_are_expected_ones_as_the_datasets_are(file, cheetah_buffer):
     model = OnlineDTFM.load(file, make_venv(), dataset=cheetah_buffer, return_steps=2, **ONLINE)
     model.set_dataset(cheetah_buffer)
-    model.own = cheetah_buffer.best(best_share=0.2)
+    model.replay_buffer = cheetah_buffer.best(best_share=0.2)
     asked = []
     model._batches = lambda buffer, *_: (asked.append(buffer.returns_to_go[buffer.rows]), iter(()))[1]
     model._imitated()
     _, own = asked
-    assert (own != model.own.returns_to_go[model.own.rows]).any()
+    assert (own != model.replay_buffer.returns_to_go[model.replay_buffer.rows]).any()
 
 
 def test_own_episodes_are_saved_and_taken_up(model, tmp_path):
     with pytest.raises(ValueError, match="no own episodes"):
         model.save_replay_buffer(tmp_path / "own.npz")
     model.learn(60).save_replay_buffer(tmp_path / "own")
-    before, model.own = model.own, None
+    before, model.replay_buffer = model.replay_buffer, None
     model.load_replay_buffer(tmp_path / "own")
     for name in ("observations", "actions", "rewards", "returns_to_go"):
-        th.testing.assert_close(getattr(model.own, name), getattr(before, name), rtol=0, atol=0)
-    np.testing.assert_array_equal(model.own.successes, before.successes)
-    np.testing.assert_array_equal(model.own.terminated, before.terminated)
+        th.testing.assert_close(getattr(model.replay_buffer, name), getattr(before, name), rtol=0, atol=0)
+    np.testing.assert_array_equal(model.replay_buffer.successes, before.successes)
+    np.testing.assert_array_equal(model.replay_buffer.terminated, before.terminated)
+    model.learn(3, CheckpointCallback(1, str(tmp_path), save_replay_buffer=True), reset_num_timesteps=False)
+    model.load_replay_buffer(tmp_path / f"rl_model_replay_buffer_{model.num_timesteps}_steps.pkl")
+    assert model.replay_buffer.episode_lengths.tolist()[: before.n_episodes] == before.episode_lengths.tolist()
     buffer = TrajectoryBuffer.from_trajectories(
         [Trajectory(np.zeros((2, 3)), np.zeros((2, 6)), np.zeros(2))], model.action_space
     )
@@ -176,7 +181,7 @@ def test_a_critic_learns_of_all_episodes(cheetah_buffer, tmp_path):
     make_model(DTFM, cheetah_buffer, policy_kwargs=policy_kwargs).learn(2).save(tmp_path / "guided.zip")
     model = OnlineDTFM.load(tmp_path / "guided.zip", make_venv(), dataset=cheetah_buffer, **ONLINE)
     model.set_dataset(episodes([0.0] * 4, [None] * 4, first=0.0))
-    model.own = episodes([-1e3] * 4, [False] * 4)
+    model.replay_buffer = episodes([-1e3] * 4, [False] * 4)
     generator = th.Generator().manual_seed(0)
     batch = model._sample_transitions(64, generator)
     assert int((batch.observations[:, 0] > 50).sum()) == 32
@@ -225,7 +230,7 @@ def test_episodes_that_had_ended_survive_an_interrupt(model):
 
     with pytest.raises(KeyboardInterrupt):
         model.learn(90, Interrupt())
-    assert model.own.episode_lengths.tolist() == [4, 7, 4]
+    assert model.replay_buffer.episode_lengths.tolist() == [4, 7, 4]
 
 
 def test_a_turn_that_was_interrupted_while_it_learned_is_learned_to_its_end(file, cheetah_buffer, tmp_path, monkeypatch):
@@ -286,8 +291,8 @@ def test_own_episodes_of_double_precision_are_taken_up(tmp_path):
     model = OnlineDTFM.load(tmp_path / "offline.zip", venv, dataset=demonstrations, **ONLINE).learn(8)
     model.save_replay_buffer(tmp_path / "own.npz")
     model.load_replay_buffer(tmp_path / "own.npz")
-    n_before = model.own.n_episodes
-    assert model.learn(8).own.n_episodes > n_before
+    n_before = model.replay_buffer.n_episodes
+    assert model.learn(8).replay_buffer.n_episodes > n_before
 
 
 def test_a_learning_rate_that_no_file_holds_is_asked_for_again(cheetah_buffer, tmp_path):
