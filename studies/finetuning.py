@@ -168,14 +168,20 @@ def by_attempted_steps(folder: Path, task: str) -> tuple[np.ndarray, np.ndarray]
     """
     :param folder: of rows; each label has learned from so many attempts beside the same demonstrations, one from none
     :param task: to look at
-    :return: how many steps the attempts have, (N,) from 0 on, and what each seed's final episodes came to, (seeds, N)
+    :return: how many steps the attempts of a seed have on average, (N,) from 0 on, and what each seed's final episodes came
+        to, (seeds, N)
     """
     groups = [runs_of(group, task) for study in read_studies([folder]) for group in study.groups]
-    found = sorted(filter(None, groups), key=lambda runs: runs[0].final["data"]["n_steps"])
+    found = sorted(filter(None, groups), key=mean_steps)
     if len({tuple(run.cell.seed for run in runs) for runs in found}) != 1:
         raise SystemExit(f"{folder}: rows of {task} with the same seeds for each label are needed.")
-    steps = np.array([runs[0].final["data"]["n_steps"] for runs in found])
+    steps = np.array([mean_steps(runs) for runs in found])
     return steps - steps[0], np.array([[row_value(run.final) for run in runs] for runs in found]).T
+
+
+def mean_steps(runs: list[Run]) -> float:
+    """Of what they learned from."""
+    return float(np.mean([run.final["data"]["n_steps"] for run in runs]))
 
 
 def new_figure(n: int = 1) -> tuple[Figure, list[Axes]]:
