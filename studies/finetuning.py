@@ -158,8 +158,9 @@ def plot_attempts(folder: Path) -> Figure:
     figure, fields = new_figure(len(tasks))
     for axes, task in zip(fields, tasks, strict=True):
         draw_curve(axes, *by_attempted_steps(folder, task), "C0", marker="o")
-        axes.set(title=task, xlabel="environment steps of all attempts")
-        axes.set_ylim(top=100)
+        axes.set(title=task, xlabel="thousand environment steps of all attempts")
+        axes.xaxis.set_major_formatter(lambda steps, _: f"{steps / 1000:g}")
+    fields[0].set_ylim(top=100)
     fields[0].set_ylabel("solved, %")
     return figure
 
@@ -188,7 +189,7 @@ def new_figure(n: int = 1) -> tuple[Figure, list[Axes]]:
     """With `n` fields side by side."""
     figure = Figure(figsize=(2.9 + 3.6 * n, 3.8), layout="constrained")
     FigureCanvasAgg(figure)
-    return figure, list(figure.subplots(1, n, squeeze=False)[0])
+    return figure, list(figure.subplots(1, n, sharey=True, squeeze=False)[0])
 
 
 def draw_curve(axes: Axes, steps: Any, values: np.ndarray, color: str, marker: str = "") -> None:
