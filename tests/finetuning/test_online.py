@@ -166,8 +166,10 @@ def test_own_episodes_are_saved_and_taken_up(model, tmp_path):
     np.testing.assert_array_equal(model.replay_buffer.successes, before.successes)
     np.testing.assert_array_equal(model.replay_buffer.terminated, before.terminated)
     model.learn(3, CheckpointCallback(1, str(tmp_path), save_replay_buffer=True), reset_num_timesteps=False)
+    kept = model.replay_buffer
     model.load_replay_buffer(tmp_path / f"rl_model_replay_buffer_{model.num_timesteps}_steps.pkl")
-    assert model.replay_buffer.episode_lengths.tolist()[: before.n_episodes] == before.episode_lengths.tolist()
+    assert model.replay_buffer.episode_lengths.tolist() == kept.episode_lengths.tolist()
+    th.testing.assert_close(model.replay_buffer.actions, kept.actions, rtol=0, atol=0)
     buffer = TrajectoryBuffer.from_trajectories(
         [Trajectory(np.zeros((2, 3)), np.zeros((2, 6)), np.zeros(2))], model.action_space
     )
