@@ -109,3 +109,11 @@ def test_what_has_no_flow_in_two_dimensions_is_not_drawn(algorithm, n_numbers, c
     model = make_model(algorithm, cheetah_buffer)
     with pytest.raises(ValueError, match=f"Only a flow of two numbers .* starts from {n_numbers} numbers"):
         model.learn(1, callback=EveryNTimesteps(1, FlowFigure()))
+
+
+def test_learning_begins_by_saying_how_often_it_will_see_the_data(capsys):
+    model = make_model(DTFM, make_buffer([5, 7]), batch_size=4, verbose=1)
+    model.learn(6, log_interval=None)
+    assert "6 gradient steps of 4 windows: 2.0 epochs of 12 recorded steps" in capsys.readouterr().out
+    model.learn(3, log_interval=None, reset_num_timesteps=False)
+    assert "3 gradient steps of 4 windows: 1.0 epochs of 12 recorded steps" in capsys.readouterr().out

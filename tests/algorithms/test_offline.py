@@ -21,7 +21,6 @@ from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer, expected
 from sb3_dtfm.data.cache import Fingerprint, load_cached
 from tests.conftest import TINY_FLOW_POLICY, TINY_POLICY, make_env, record_random_episodes
-from tests.data.small import make_buffer
 
 ALGORITHMS = [(DT, TINY_POLICY), (DTFM, TINY_FLOW_POLICY)]
 IDS = ["dt", "dtfm"]
@@ -237,14 +236,6 @@ def test_without_time_steps_and_with_more_starts(algorithm, policy_kwargs, cheet
     assert loaded.timestep_exponent == 1.5
     assert loaded.return_weight == 5.0
     assert loaded.policy.network.trunk.embed_timestep is None
-
-
-def test_learning_begins_by_saying_how_often_it_will_see_the_data(capsys):
-    model = make_model(DTFM, make_buffer([5, 7]), batch_size=4, verbose=1)
-    model.learn(6, log_interval=None)
-    assert "6 gradient steps of 4 windows: 2.0 epochs of 12 recorded steps" in capsys.readouterr().out
-    model.learn(3, log_interval=None, reset_num_timesteps=False)
-    assert "3 gradient steps of 4 windows: 1.0 epochs of 12 recorded steps" in capsys.readouterr().out
 
 
 def test_expected_returns_are_what_is_learned_from_and_asked_for(cheetah_buffer, tmp_path, monkeypatch, capsys):
