@@ -10,8 +10,32 @@ from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.envs import ReturnToGoWrapper
 from tests.recorded import minari_folder, workplace  # noqa: F401  (fixtures of the rooms that use the command line)
 
-TINY_POLICY = dict(embed_dim=32, n_layers=2, n_heads=2)
-TINY_FLOW_POLICY = dict(TINY_POLICY, flow_hidden_dim=32, flow_n_layers=2, n_solver_steps=4)
+# Decision Transformer's own settings at a tiny size; those that the classes have by default are tested beside them.
+TINY_POLICY = dict(
+    embed_dim=32,
+    n_layers=2,
+    n_heads=2,
+    dropout=0.1,
+    tokens_per_step=3,
+    timestep_embedding=True,
+    chunk_size=1,
+    return_scaling="max",
+    clip_return_to_go=False,
+    film_return_to_go=False,
+    calm_units=False,
+)
+TINY_FLOW_POLICY = dict(
+    TINY_POLICY,
+    flow_hidden_dim=32,
+    flow_n_layers=2,
+    flow_prediction="velocity",
+    flow_tau_exponent=1.0,
+    regression_coef=0.0,
+    n_solver_steps=4,
+    one_step=True,
+)
+# Constant learning rate and the newest weights: what a few gradient steps change shows at once.
+PLAIN = dict(learning_rate=1e-4, learning_rate_schedule="constant", warmup_steps=0, ema_decay=0.0, return_weight=0.0)
 EPISODE_LENGTH = 30
 
 

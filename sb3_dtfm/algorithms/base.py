@@ -30,6 +30,7 @@ from sb3_dtfm.arguments import (
     check_arguments,
 )
 from sb3_dtfm.data import Dataset, DatasetError, ScoreReference, TrajectoryBuffer, check_action_space, load_dataset
+from sb3_dtfm.data.decisions import Decision, decide
 from sb3_dtfm.distributed import check_batch_size, first_of_each_machine_first, is_first_process
 from sb3_dtfm.envs import check_vec_env, known_task, return_to_go_space
 from sb3_dtfm.files import ModelFile, file_name, holds_pickles, read_model, write_model, write_onnx
@@ -110,21 +111,21 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         policy: str | type[SequencePolicy],
         env: GymEnv | str | None = None,
         dataset: Dataset | None = None,
-        learning_rate: float | Schedule = 1e-4,
+        learning_rate: float | Schedule = 1e-3,
         batch_size: int = 256,
         weight_decay: float = 1e-3,
-        context_length: int = 20,
+        context_length: int = 1,
         dataset_fraction: float = 1.0,
         dataset_seed: int = 0,
         timestep_exponent: float = 1.0,
-        return_weight: float = 0.0,
+        return_weight: float = 5.0,
         return_steps: int | None = None,
         dataset_kwargs: dict[str, Any] | None = None,
         max_grad_norm: float | None = None,
-        warmup_steps: int = 0,
-        learning_rate_schedule: str = "constant",
-        ema_decay: float = 0.0,
-        precision: str = "auto",
+        warmup_steps: int = 100,
+        learning_rate_schedule: str = "cosine",
+        ema_decay: float = 0.999,
+        precision: str = "float32",
         compile: bool | None = None,
         policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
@@ -168,6 +169,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         self.max_timestep = 1000
         self.time_limit: int | None = None  # of the newest environment that it learned for
         self.score_reference: ScoreReference | None = None
+        self.decisions: list[Decision] = []
         self.buffer: TrajectoryBuffer | None = None
         self._means = RunningMeans()
         self._training_seconds, self._timed_steps = 0.0, 0
@@ -177,14 +179,24 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
             self._check_arguments(learning_rate=POSITIVE)
             buffer = self._load_buffer()
             self.max_timestep = int(buffer.episode_lengths.max())
+            self._decide(buffer)
             self.score_reference = buffer.score_reference
             self._setup_model()
             normalization = self.policy.normalization
             normalization.set_statistics(*buffer.statistics())
+            if normalization.return_mean is not None:
+                normalization.set_return_to_go_moments(buffer.return_to_go_moments())
             if normalization.return_to_go_range is not None:
                 normalization.set_return_to_go_range(buffer.return_to_go_range())
             if self.policy.critic is not None:
                 self.policy.critic.set_scale(buffer.largest_discounted_return(self.policy.gamma))
+
+    def _decide(self, buffer: TrajectoryBuffer) -> None:
+        """Have the data decide of the policy's arguments what the user has left open; they are saved with the others."""
+        given = self.policy_kwargs or {}
+        names = self._policy_class.parameter_names() - set(given)
+        self.decisions = [each for each in decide(buffer) if each.name in names]
+        self.policy_kwargs = {**{each.name: each.value for each in self.decisions}, **given}
 
     def _check_arguments(self, learning_rate: Rule) -> None:
         """
@@ -437,7 +449,16 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
             "ep_info_buffer",
             "ep_success_buffer",
         ]
-        made_anew = ["lr_schedule", "action_noise", "dataset", "buffer", "_training_seconds", "_timed_steps", "_last_saved"]
+        made_anew = [
+            "decisions",
+            "lr_schedule",
+            "action_noise",
+            "dataset",
+            "buffer",
+            "_training_seconds",
+            "_timed_steps",
+            "_last_saved",
+        ]
         return [*super()._excluded_save_params(), *of_an_environment, *made_anew]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

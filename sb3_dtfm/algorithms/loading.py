@@ -44,6 +44,7 @@ POSITIVE_BUFFERS = {
     "normalization.observation_std",
     "normalization.observation_gain",
     "normalization.return_scale",
+    "normalization.return_std",
     "critic.reward_scale",
     "critic.spread",
 }

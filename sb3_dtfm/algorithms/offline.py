@@ -132,6 +132,9 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
             epochs = n_steps * self.batch_size / len(buffer)
             sizes = f"{n_steps:,} gradient steps of {self.batch_size} windows"
             print(f"{sizes}: {epochs:.1f} epochs of {len(buffer):,} recorded steps", flush=True)
+            for reason in dict.fromkeys(each.reason for each in self.decisions):
+                chosen = ", ".join(f"{each.name}={each.value}" for each in self.decisions if each.reason == reason)
+                print(f"{reason} So {chosen}.", flush=True)
         batches = self._batches(buffer, self.batch_size)
         callback.on_training_start(locals(), globals())
         parallel.from_first(True)  # which may evaluate for longer than a gradient step's messages wait

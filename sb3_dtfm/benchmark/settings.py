@@ -12,7 +12,7 @@ from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.zoo.arguments import UsageError, asking_for
 from sb3_dtfm.zoo.registration import packaged_config, policy_of, with_policy_options
 
-PROFILES = {"paper": None, "small": "small"}
+PROFILES = {"default": None, "paper": "paper"}
 # Keys of the grid; a profile or `-params` that sets them would contradict it.
 GRID_KEYS = ("dataset_fraction", "dataset_seed", "seed")
 # Keys that RL-Zoo takes for itself; the others go to the constructor.
@@ -59,7 +59,7 @@ def read_profile(profile: str, algo: str, env_id: str) -> dict[str, Any]:
     """
     Settings of one task, or those for any other.
 
-    :param profile: "small", "paper", a YAML file for all algorithms, or a folder with one for each
+    :param profile: "default", "paper", a YAML file for all algorithms, or a folder with one for each
     :param algo: for example "dtfm"
     :param env_id: Gymnasium id
     :raises UsageError: no such file, or it holds no settings for the task
@@ -69,7 +69,7 @@ def read_profile(profile: str, algo: str, env_id: str) -> dict[str, Any]:
     else:
         path = Path(profile) / f"{algo}.yml" if Path(profile).is_dir() else Path(profile)
     if not path.is_file():
-        raise UsageError(f"--profile {profile}: {path} does not exist; expected small, paper, a YAML file or a folder.")
+        raise UsageError(f"--profile {profile}: {path} does not exist; expected default, paper, a YAML file or a folder.")
     profiles = read_yaml(path)
     settings = profiles.get(env_id, profiles.get("default"))
     if not isinstance(settings, dict):

@@ -40,7 +40,7 @@ def benchmark_parser() -> argparse.ArgumentParser:
     )
     grid("--algo", dest="algos", nargs="+", choices=algos, default=algos, help="all by default")
     grid("--seeds", "--seed", type=int, nargs="+", default=[0], metavar="SEED", help="0 by default")
-    grid("--profile", default="small", help="small (default), paper, a YAML file, or a folder with dt.yml and dtfm.yml")
+    grid("--profile", default="default", help="default, paper, a YAML file, or a folder with dt.yml and dtfm.yml")
     grid("--gym-packages", nargs="+", default=[], metavar="MODULE", help="to import first: they register tasks")
     grid("--label", default="", help="name of what -params change; part of a cell's identity")
     data = parser.add_argument_group("data").add_argument

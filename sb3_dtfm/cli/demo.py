@@ -41,7 +41,7 @@ def main(argv: Sequence[str]) -> None:
         description="Record demonstrations of robosuite's Lift, train DTFM on half of them, and measure its success.",
     )
     parser.add_argument("--output", default="demo", metavar="FOLDER", help="where everything goes, ./demo by default")
-    parser.add_argument("--steps", type=int, metavar="N", help="gradient steps, those of zoo_configs/small by default")
+    parser.add_argument("--steps", type=int, metavar="N", help="gradient steps, those of zoo_configs by default")
     parser.add_argument("--episodes", type=int, default=50, metavar="N", help="evaluation episodes, 50 by default")
     parser.add_argument("--demonstrations", type=int, default=N_DEMONSTRATIONS, metavar="N", help="200 by default")
     options = parser.parse_args(argv)
@@ -54,7 +54,7 @@ def run_demo(folder: Path, n_demonstrations: int, n_steps: int | None, n_episode
 
     :param folder: where everything goes
     :param n_demonstrations: demonstrations to record; training sees half of them
-    :param n_steps: gradient steps, None for those of the packaged small settings
+    :param n_steps: gradient steps, None for those of the packaged settings
     :param n_episodes: episodes of the final evaluation
     :return: what `evaluation.json` holds
     """
@@ -102,7 +102,7 @@ def train_if_missing(folder: Path, dataset: Path, n_steps: int | None) -> Path:
     if finished:
         print(f"{finished[-1]} is there already.")
         return finished[-1]
-    arguments = ["--algo", "dtfm", "--env", ENV_ID, "--conf-file", "small"]
+    arguments = ["--algo", "dtfm", "--env", ENV_ID]
     arguments += ["--dataset", str(dataset), "--dataset-fraction", str(DATASET_FRACTION)]
     arguments += ["--eval-freq", str(EVALUATION_INTERVAL), "--eval-episodes", "10", "--n-eval-envs", "5"]
     arguments += ["--log-folder", str(folder / "logs"), "--tensorboard-log", str(folder / "tensorboard")]

@@ -131,7 +131,7 @@ def command(
     :param found: in it
     """
     algo = "dtfm" if isinstance(buffer.action_space, spaces.Box) else "dt"
-    words = ["sb3-dtfm", "train", "--algo", algo, "--env", buffer.env_id or "TASK", "--conf-file", "small"]
+    words = ["sb3-dtfm", "train", "--algo", algo, "--env", buffer.env_id or "TASK"]
     words += ["--dataset", *datasets, "--target-return", f"{found.target_return:g}"]
     if dataset_kwargs:
         inside = ", ".join(f"{key}={value!r}" for key, value in dataset_kwargs)

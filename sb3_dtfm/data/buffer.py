@@ -164,6 +164,23 @@ class TrajectoryBuffer(FlatSteps):
         high = th.full((n_timesteps,), -th.inf).scatter_reduce_(0, timesteps, values, "amax")
         return th.stack((low, high))
 
+    def return_to_go_moments(self) -> th.Tensor:
+        """
+        Mean and standard deviation of the return-to-go at each time step, over the buffer's own episodes.
+
+        A standard deviation is at least a twentieth of that over all steps, and a thousandth of the largest return-to-go:
+        where returns hardly differ, their differences stay small.
+
+        :return: (2, T) of the T steps of the longest episode, environment reward units
+        """
+        timesteps, values = self.timesteps.cpu(), self.returns_to_go[self.rows].cpu().double()
+        zeros = th.zeros(int(self.episode_lengths.max()), dtype=th.float64)
+        count = zeros.index_add(0, timesteps, th.ones_like(values))
+        mean = zeros.index_add(0, timesteps, values) / count
+        variance = zeros.index_add(0, timesteps, (values - mean[timesteps]).square()) / count
+        smallest = max(float(values.std(correction=0)) / 20.0, float(values.abs().max()) / 1000.0)
+        return th.stack((mean, variance.sqrt().clamp(min=smallest or 1.0))).float()
+
     def with_expected_returns(self, n_steps: int, seed: int) -> "TrajectoryBuffer":
         """
         A buffer whose returns-to-go are hardly luck: what came after n steps is replaced by what may be expected after such

@@ -12,7 +12,6 @@ from torch import nn
 from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, POSITIVE, Choice, Number, Rule, check_arguments
 from sb3_dtfm.heads.base import ActionHead, masked_mean
 from sb3_dtfm.heads.regression import RegressionHead
-from sb3_dtfm.networks.cpu import Linear
 from sb3_dtfm.networks.film import FilmNetwork, VectorField
 from sb3_dtfm.networks.solvers import SOLVERS, integrate, solver_times
 
@@ -31,7 +30,7 @@ OPTIONS: dict[str, Rule] = {
     "regression_coef": NOT_NEGATIVE,
     "one_step": BOOLEAN,
 }
-ACTING: dict[str, Rule] = {"solver": Choice((*SOLVERS, ONE_STEP)), "n_solver_steps": Number(low=1, high=10_000, whole=True)}
+ACTING: dict[str, Rule] = {"solver": Choice((*SOLVERS, ONE_STEP)), "n_solver_steps": Number(low=0, high=10_000, whole=True)}
 
 
 def interpolate(noise: th.Tensor, action: th.Tensor, tau: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -61,6 +60,10 @@ class FlowHead(ActionHead):
     prediction is tanh(W h + b + FiLM network), whose last term starts at zero: training starts from Decision Transformer's
     regression, and what noise and time have to add to it is learned.
 
+    With `regression_coef` above 0, trunk and W h + b learn by Decision Transformer's loss, and the FiLM network by flow
+    matching from a hidden state that it gives no gradient. `n_solver_steps=0` then acts with tanh(W h + b), the mean action.
+    By the flow's loss alone the trunk learns the mean more slowly.
+
     With `one_step` a second network learns where `n_solver_steps` of Euler end, 16 at most, so that an action can take one
     evaluation instead of one per solver step. It learns from the field and gives nothing back: trunk and field are what they
     are without it. Where the field predicts actions, this network adds to the same W h + b, and starts at zero too; else it
@@ -74,9 +77,9 @@ class FlowHead(ActionHead):
     :param flow_tau_exponent: tau of the loss is u to this power for u uniform in [0, 1]: above 1 it is more often near the
         noise, where the action has to come from the hidden state
     :param solver: how to act: an ODE solver, euler, midpoint, heun or rk4; or one_step, the network that learnt its end
-    :param n_solver_steps: steps of the ODE solver
+    :param n_solver_steps: steps of the ODE solver; 0 takes the mean action, which no noise changes
     :param one_step: train that network
-    :param regression_coef: weight of an auxiliary regression of the action from the hidden state; 0 leaves it out
+    :param regression_coef: weight of the regression of the action from the hidden state; 0 leaves it out
     :raises ValueError: an option out of range, by name
     """
 
@@ -88,14 +91,14 @@ class FlowHead(ActionHead):
         embed_dim: int,
         action_dim: int,
         *,
-        flow_hidden_dim: int = 512,
+        flow_hidden_dim: int = 128,
         flow_n_layers: int = 3,
-        flow_prediction: str = "velocity",
-        flow_tau_exponent: float = 1.0,
+        flow_prediction: str = "action",
+        flow_tau_exponent: float = 2.0,
         solver: str = "euler",
-        n_solver_steps: int = 50,
-        one_step: bool = True,
-        regression_coef: float = 0.0,
+        n_solver_steps: int = 10,
+        one_step: bool = False,
+        regression_coef: float = 1.0,
     ) -> None:
         super().__init__(embed_dim, action_dim)
         check_arguments(locals(), OPTIONS)
@@ -104,29 +107,32 @@ class FlowHead(ActionHead):
         self.regression_coef = regression_coef
         sizes = (action_dim, embed_dim, flow_hidden_dim, flow_n_layers)
         self.vector_field = VectorField(*sizes)
-        self.regression = Linear(embed_dim, action_dim) if flow_prediction == "action" else None
+        self.predicts_action = flow_prediction == "action"
+        regresses = self.predicts_action or regression_coef > 0
+        self.regression = RegressionHead(embed_dim, action_dim) if regresses else None
         self.one_step = FilmNetwork(*sizes) if one_step else None
-        if self.regression is not None:
+        if self.predicts_action:
             for network in (self.vector_field, self.one_step):
                 if network is not None:
                     nn.init.zeros_(network.output.weight)
                     nn.init.zeros_(network.output.bias)
-        self.auxiliary = RegressionHead(embed_dim, action_dim) if regression_coef > 0 else None
         acting = self.check_acting(solver=solver, n_solver_steps=n_solver_steps)
         self.solver: str = acting["solver"]
         self.n_solver_steps: int = acting["n_solver_steps"]
-        self.n_distilled_steps = min(n_solver_steps, MAX_DISTILLED_STEPS)  # however it acts later
+        self.n_distilled_steps = min(max(n_solver_steps, 1), MAX_DISTILLED_STEPS)  # however it acts later
 
     def check_acting(self, **choices: Any) -> dict[str, Any]:
         choices = check_arguments(choices, ACTING)
         if choices["solver"] == ONE_STEP and self.one_step is None:
             raise ValueError(f"solver={ONE_STEP!r} needs a model that was trained with policy_kwargs=dict(one_step=True).")
+        if choices["n_solver_steps"] == 0 and not self.regression_coef:
+            raise ValueError("n_solver_steps=0 needs a model that was trained with policy_kwargs=dict(regression_coef=1.0).")
         return choices
 
     @property
     def noise_decides(self) -> bool:
-        """Not by one step of Euler, which ends at the mean action from wherever it begins."""
-        return (self.solver, self.n_solver_steps) != ("euler", 1)
+        """Not without a solver's step, nor by one of Euler, which ends at the mean action from wherever it begins."""
+        return self.solver == ONE_STEP or self.n_solver_steps > (1 if self.solver == "euler" else 0)
 
     def draw_noise(self, actions: th.Tensor, generator: th.Generator) -> tuple[th.Tensor, ...]:
         batch_size, context_length = actions.shape[:2]
@@ -140,11 +146,12 @@ class FlowHead(ActionHead):
         self, hidden: th.Tensor, actions: th.Tensor, mask: th.Tensor, *noise: th.Tensor
     ) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         starts, tau = noise
-        loss = self.flow_loss(hidden, actions, mask, starts, tau)
+        loss = self.flow_loss(hidden.detach() if self.regression_coef else hidden, actions, mask, starts, tau)
         parts = {"flow_loss": loss}
-        if self.auxiliary is not None:
-            regression_loss, auxiliary_parts = self.auxiliary.loss(hidden, actions, mask)
-            loss, parts = loss + self.regression_coef * regression_loss, {**parts, **auxiliary_parts}
+        if self.regression_coef:
+            assert self.regression is not None
+            regression_loss, regression_parts = self.regression.loss(hidden, actions, mask)
+            loss, parts = loss + self.regression_coef * regression_loss, {**parts, **regression_parts}
         if self.one_step is not None:
             parts["one_step_loss"] = self.one_step_loss(hidden[:, -1], mask[:, -1], starts[:, -1])
             loss = loss + parts["one_step_loss"]
@@ -168,8 +175,14 @@ class FlowHead(ActionHead):
         x, velocity = interpolate(noise, actions, in_turn(tau.unsqueeze(-1), actions.shape[1]))
         time_share = in_turn(self.vector_field.time_share(tau), actions.shape[1])
         output = self.vector_field(x, self.vector_field.film_condition(hidden) + time_share)
-        error = output - velocity if self.regression is None else (self.regression(hidden) + output).tanh() - actions
+        error = (self._regressed(hidden) + output).tanh() - actions if self.predicts_action else output - velocity
         return masked_mean(error.square(), mask)
+
+    def _regressed(self, hidden: th.Tensor) -> th.Tensor:
+        """W h + b, (..., A); learned by the regression alone where there is one."""
+        assert self.regression is not None
+        regressed = self.regression.linear(hidden)
+        return regressed.detach() if self.regression_coef else regressed
 
     def one_step_loss(self, hidden: th.Tensor, mask: th.Tensor, noise: th.Tensor) -> th.Tensor:
         """
@@ -188,13 +201,16 @@ class FlowHead(ActionHead):
     def forward(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
         if self.solver == ONE_STEP:
             return self.one_step_action(hidden, noise)
+        if self.n_solver_steps == 0:
+            assert self.regression is not None
+            return self.regression(hidden)
         return self.solve(hidden, noise, self.solver, self.n_solver_steps)
 
     def one_step_action(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
         """From noise (..., A) to actions (..., A) in one step. No gradient flows into the field's W h + b."""
         assert self.one_step is not None
         change = self.one_step(noise, self.one_step.film_condition(hidden))
-        return noise + change if self.regression is None else (self.regression(hidden).detach() + change).tanh()
+        return (self._regressed(hidden).detach() + change).tanh() if self.predicts_action else noise + change
 
     def solve(self, hidden: th.Tensor, noise: th.Tensor, solver: str, n_solver_steps: int) -> th.Tensor:
         """
@@ -210,7 +226,7 @@ class FlowHead(ActionHead):
         """
         times = solver_times(solver, n_solver_steps, hidden.device)
         condition, time_shares = self.vector_field.film_condition(hidden), self.vector_field.time_share(times)
-        regressed = None if self.regression is None else self.regression(hidden)
+        regressed = self._regressed(hidden) if self.predicts_action else None
         velocity = noise
 
         def field(x: th.Tensor, tau: float) -> th.Tensor:
@@ -254,5 +270,5 @@ class FlowHead(ActionHead):
             "flow_n_layers": trial.suggest_int("flow_n_layers", 2, 4),
             "flow_prediction": trial.suggest_categorical("flow_prediction", ["velocity", "action"]),
             "flow_tau_exponent": trial.suggest_categorical("flow_tau_exponent", [1.0, 2.0]),
-            "n_solver_steps": trial.suggest_categorical("n_solver_steps", [1, 3, 10, 50]),
+            "n_solver_steps": trial.suggest_categorical("n_solver_steps", [0, 3, 10, 50]),
         }

@@ -76,7 +76,7 @@ class ActingPolicy(BasePolicy):
 
         :return: (B, K, D), or (B, 1, D) of the newest steps with `last_only`
         """
-        return network.trunk(**self.normalization(windows)._asdict(), last_only=last_only)
+        return network.trunk(**network.within_range(self.normalization(windows))._asdict(), last_only=last_only)
 
     def predict(
         self,
@@ -339,7 +339,9 @@ class ActingPolicy(BasePolicy):
         windows = Windows(*(th.from_numpy(each if caches else each[due]).to(device) for each in context.windows))
         if not caches:
             return self.hidden_states(self.acting_network, windows, last_only=True).squeeze(1), keys_values
-        hidden, keys_values = self.acting_network.extend(self.normalization(windows), context.keys_values)
+        hidden, keys_values = self.acting_network.extend(
+            self.acting_network.within_range(self.normalization(windows)), context.keys_values
+        )
         return (hidden[th.from_numpy(due).to(device)] if due.any() else None), keys_values
 
     def _decode(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:

@@ -83,7 +83,8 @@ class ExportedPolicy(nn.Module):
         """
         trunk, head = self.network.trunk, self.network.head
         scaled = self.normalization.scale_action(actions)
-        windows = self.normalization(Windows(observations, scaled, returns_to_go, timesteps, mask))._asdict()
+        normalized = self.normalization(Windows(observations, scaled, returns_to_go, timesteps, mask))
+        windows = self.network.within_range(normalized)._asdict()
         kept: tuple[th.Tensor, ...] = ()
         if keys_values is None:
             hidden = trunk(**windows, last_only=True).squeeze(1)

@@ -11,9 +11,11 @@ from sb3_dtfm.windows import Transitions, Windows
 
 # Observations are clipped at this many standard deviations, as SB3's VecNormalize does.
 OBSERVATION_CLIP = 10.0
-# Returns-to-go are clipped at this many times the largest one of the data, far beyond what an average over remaining steps
-# makes of them, so that no number overflows on its way through a network.
+# Scaled returns-to-go are clipped here, far beyond those of the data, so that no number overflows.
 RETURN_TO_GO_CLIP = 1e3
+# Standard deviations of the returns-to-go at a time step that become 1, and at which they are clipped.
+RETURN_UNIT, RETURN_CLIP = 4.0, 5.0
+RETURN_SCALINGS = ("timestep", "max")
 # A dimension whose standard deviation is smaller is a constant, and becomes zero.
 SMALLEST_STD = 1e-6
 
@@ -26,8 +28,9 @@ class Normalization(nn.Module):
     :param action_space: bounded Box (A,)
     :param max_timestep: T, the longest episode; time steps with a range of return-to-go of their own
     :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step
-    :param average_return_to_go: divide it by the steps that remain of T (Emmons et al., *RvS*, 2022): what is asked for is
-        then the same number from the first step to the last, and does not run out with the episode
+    :param return_scaling: "timestep" subtracts the mean of the data's returns-to-go at the same time step and divides by
+        their standard deviation there: good and bad episodes are as far apart at the last step as at the first one. "max"
+        divides by the largest return-to-go of the data, as Decision Transformer does; None makes it zero
     :param calm_units: what calm episodes spread becomes 1, instead of the standard deviation over all
     """
 
@@ -35,6 +38,8 @@ class Normalization(nn.Module):
     observation_std: th.Tensor
     observation_gain: th.Tensor
     return_scale: th.Tensor
+    return_mean: th.Tensor | None
+    return_std: th.Tensor | None
     return_to_go_range: th.Tensor | None
     action_low: th.Tensor
     action_high: th.Tensor
@@ -44,18 +49,21 @@ class Normalization(nn.Module):
         observation_dim: int,
         action_space: spaces.Box,
         max_timestep: int,
-        clip_return_to_go: bool,
-        average_return_to_go: bool = False,
+        clip_return_to_go: bool = True,
+        return_scaling: str | None = "timestep",
         calm_units: bool = False,
     ) -> None:
         super().__init__()
         self.max_timestep = max_timestep
-        self.average_return_to_go = average_return_to_go
         self.calm_units = calm_units
         self.register_buffer("observation_mean", th.zeros(observation_dim))
         self.register_buffer("observation_std", th.ones(observation_dim))
         self.register_buffer("observation_gain", th.ones(observation_dim))
         self.register_buffer("return_scale", th.ones(()))
+        self.return_scaling = return_scaling
+        by_timestep = return_scaling == "timestep"
+        self.register_buffer("return_mean", th.zeros(max_timestep) if by_timestep else None)
+        self.register_buffer("return_std", th.ones(max_timestep) if by_timestep else None)
         unlimited = th.tensor([[-th.inf], [th.inf]]).repeat(1, max_timestep) if clip_return_to_go else None
         self.register_buffer("return_to_go_range", unlimited)
         for name, bound in (("action_low", action_space.low), ("action_high", action_space.high)):
@@ -84,6 +92,16 @@ class Normalization(nn.Module):
             self.observation_gain.copy_(th.from_numpy(gain))
         self.return_scale.fill_(return_scale if return_scale > 0 else 1.0)
 
+    def set_return_to_go_moments(self, moments: th.Tensor) -> None:
+        """
+        :param moments: (2, max_timestep), mean and standard deviation of the return-to-go by time step, environment reward
+            units; the latter positive
+        """
+        assert self.return_mean is not None
+        assert self.return_std is not None
+        self.return_mean.copy_(moments[0])
+        self.return_std.copy_(moments[1])
+
     def set_return_to_go_range(self, limits: th.Tensor) -> None:
         """
         :param limits: (2, max_timestep), smallest and largest return-to-go by time step, environment reward units
@@ -94,19 +112,25 @@ class Normalization(nn.Module):
     def forward(self, windows: Windows) -> Windows:
         """
         :param windows: tensors; observations and returns-to-go as the environment gives them
-        :return: observations normalised and clipped, returns-to-go scaled to about 1 and clipped, the others as they are
+        :return: observations normalised and clipped, returns-to-go scaled to about [-1, 1], the others as they are
         """
-        returns_to_go = windows.returns_to_go
-        if self.return_to_go_range is not None:
-            low, high = self.return_to_go_range[:, windows.timesteps.clamp(max=self.max_timestep - 1)]
-            returns_to_go = returns_to_go.clamp(low, high)
-        if self.average_return_to_go:
-            remaining = (self.max_timestep - windows.timesteps).clamp(min=1)
-            returns_to_go = returns_to_go * (self.max_timestep / remaining)
         return windows._replace(
             observations=self.scale_observation(windows.observations),
-            returns_to_go=(returns_to_go / self.return_scale).clamp(-RETURN_TO_GO_CLIP, RETURN_TO_GO_CLIP),
+            returns_to_go=self._scale_return_to_go(windows.returns_to_go, windows.timesteps),
         )
+
+    def _scale_return_to_go(self, returns_to_go: th.Tensor, timesteps: th.Tensor) -> th.Tensor:
+        """From environment reward units, (B, K), to about [-1, 1]."""
+        if self.return_scaling is None:
+            return th.zeros_like(returns_to_go)
+        timesteps = timesteps.clamp(max=self.max_timestep - 1)
+        if self.return_to_go_range is not None:
+            low, high = self.return_to_go_range[:, timesteps]
+            returns_to_go = returns_to_go.clamp(low, high)
+        if self.return_mean is None or self.return_std is None:
+            return (returns_to_go / self.return_scale).clamp(-RETURN_TO_GO_CLIP, RETURN_TO_GO_CLIP)
+        deviations = (returns_to_go - self.return_mean[timesteps]) / self.return_std[timesteps]
+        return deviations.clamp(-RETURN_CLIP, RETURN_CLIP) / RETURN_UNIT
 
     def scale_observation(self, observations: th.Tensor) -> th.Tensor:
         """Normalised and clipped, (..., O)."""

@@ -26,11 +26,12 @@ from sb3_dtfm.arguments import (
 )
 from sb3_dtfm.heads import ActionHead
 from sb3_dtfm.heads.base import NOISE_ROWS
+from sb3_dtfm.networks.return_range import ReturnRange
 from sb3_dtfm.networks.trunk import SequenceTrunk
 from sb3_dtfm.policies.acting import ActingPolicy, standard_normal
 from sb3_dtfm.policies.critic import Critic
 from sb3_dtfm.policies.network import SequenceNetwork
-from sb3_dtfm.policies.normalization import Normalization
+from sb3_dtfm.policies.normalization import RETURN_SCALINGS, Normalization
 from sb3_dtfm.windows import Windows
 
 ACCEPTED: dict[str, Rule] = {
@@ -45,7 +46,8 @@ ACCEPTED: dict[str, Rule] = {
     "chunk_size": COUNT,
     "weight_decay": NOT_NEGATIVE,
     "clip_return_to_go": BOOLEAN,
-    "average_return_to_go": BOOLEAN,
+    "return_scaling": Choice(RETURN_SCALINGS),
+    "return_conditioning": BOOLEAN,
     "film_return_to_go": BOOLEAN,
     "calm_units": BOOLEAN,
     "kv_cache": BOOLEAN,
@@ -83,10 +85,11 @@ class SequencePolicy(ActingPolicy):
         et al., 2023; Chi et al., 2023). 1 is Decision Transformer's
     :param n_action_steps: how many of them are carried out before the policy looks again, half of them if not given
     :param weight_decay: AdamW's, on weight matrices only
-    :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step. Asking for more than
-        any episode reached, or falling behind, then stays an input like those the policy learned from
-    :param average_return_to_go: tell the trunk the return-to-go per remaining step of the longest episode instead of the sum
-        (Emmons et al., 2022)
+    :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step, and from such an
+        observation, see :class:`~sb3_dtfm.networks.return_range.ReturnRange`. Asking for more than any episode reached, or
+        falling behind, then stays an input like those the policy learned from
+    :param return_scaling: "timestep" or "max", see :class:`~sb3_dtfm.policies.normalization.Normalization`
+    :param return_conditioning: learn and act by the return-to-go; without it, the policy clones what was recorded
     :param film_return_to_go: let the return-to-go scale and shift what each block of the trunk gets, besides being a token
     :param calm_units: scale observations by what calm episodes spread, for data in which some agents' spread far wider; see
         :meth:`EpisodeTable.statistics`
@@ -115,20 +118,21 @@ class SequencePolicy(ActingPolicy):
         observation_space: spaces.Dict,
         action_space: ActionSpace,
         lr_schedule: Schedule,
-        context_length: int = 20,
+        context_length: int = 1,
         max_timestep: int = 1000,
-        embed_dim: int = 256,
-        n_layers: int = 10,
+        embed_dim: int = 128,
+        n_layers: int = 3,
         n_heads: int = 2,
-        dropout: float = 0.1,
-        timestep_embedding: bool = True,
-        tokens_per_step: int = 3,
+        dropout: float = 0.0,
+        timestep_embedding: bool = False,
+        tokens_per_step: int = 1,
         chunk_size: int = 1,
         n_action_steps: int | None = None,
         weight_decay: float = 1e-3,
-        clip_return_to_go: bool = False,
-        average_return_to_go: bool = False,
-        film_return_to_go: bool = False,
+        clip_return_to_go: bool = True,
+        return_scaling: str = "timestep",
+        return_conditioning: bool = True,
+        film_return_to_go: bool = True,
         calm_units: bool = False,
         critic_steps: int = 0,
         gamma: float = 0.99,
@@ -166,10 +170,14 @@ class SequencePolicy(ActingPolicy):
         self.vector_space = vector_space(action_space)
         self.action_dim = int(self.vector_space.shape[0])
         units = (self.observation_dim, self.vector_space, max_timestep)
-        self.normalization = Normalization(*units, clip_return_to_go, average_return_to_go, calm_units)
+        scaling = return_scaling if return_conditioning else None
+        self.normalization = Normalization(*units, clip_return_to_go, scaling, calm_units)
         sizes = (self.observation_dim, self.action_dim, max_timestep, embed_dim, n_layers, n_heads)
-        trunk = SequenceTrunk(*sizes, dropout, timestep_embedding, tokens_per_step, film_return_to_go)
-        self.network = SequenceNetwork(trunk, head_class(embed_dim, self.chunk_size * self.action_dim, **head_options))
+        film = film_return_to_go and return_conditioning
+        trunk = SequenceTrunk(*sizes, dropout, timestep_embedding, tokens_per_step, film)
+        head = head_class(embed_dim, self.chunk_size * self.action_dim, **head_options)
+        return_range = ReturnRange(self.observation_dim) if clip_return_to_go and return_conditioning else None
+        self.network = SequenceNetwork(trunk, head, return_range)
         self.ema_network = copy.deepcopy(self.network).requires_grad_(False) if ema else None
         self.optimizer = self._make_optimizer(lr_schedule(1.0))
         generator = th.Generator().manual_seed(0 if seed is None else seed)
@@ -245,7 +253,9 @@ class SequencePolicy(ActingPolicy):
 
     def clipped_parameters(self) -> list[nn.Parameter]:
         """The parameters whose gradient norm is logged and clipped."""
-        spared = {id(parameter) for parameter in self.network.head.unclipped_parameters()}
+        return_range = self.network.return_range
+        apart = [*self.network.head.unclipped_parameters(), *([] if return_range is None else return_range.parameters())]
+        spared = {id(parameter) for parameter in apart}
         return [parameter for parameter in self.network.parameters() if id(parameter) not in spared]
 
     def scaled_windows(self, batch: Windows) -> Windows:
@@ -269,7 +279,12 @@ class SequencePolicy(ActingPolicy):
         windows = self.scaled_windows(batch)
         chunks = self._chunks(windows.actions)
         windows = windows._replace(actions=windows.actions[:, : windows.mask.shape[1]])
-        return self.network.head.loss(self.hidden_states(self.network, windows), chunks, windows.mask, *noise)
+        seen = self.normalization(windows)
+        loss, parts = self.network.head.loss(self.network.trunk(**seen._asdict()), chunks, windows.mask, *noise)
+        if self.network.return_range is not None:
+            parts["return_range_loss"] = self.network.return_range.loss(seen.observations, seen.returns_to_go, seen.mask)
+            loss = loss + parts["return_range_loss"]
+        return loss, parts
 
     def _chunks(self, actions: th.Tensor) -> th.Tensor:
         """From actions (B, K + H - 1, A) to the H from each of K steps on, (B, K, H A), one after the other."""

@@ -19,7 +19,7 @@ from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, packaged_config
 WRAPPER = "sb3_dtfm.envs.ReturnToGoWrapper"
 TRAIN_EXAMPLES = """\
   sb3-dtfm train --algo dtfm --env HalfCheetah-v5
-  sb3-dtfm train --algo dt --env robosuite/Lift-v0 --conf-file small --dataset lift.hdf5 --dataset-fraction 0.5
+  sb3-dtfm train --algo dt --env robosuite/Lift-v0 --dataset lift.hdf5 --dataset-fraction 0.5
 """
 
 
@@ -96,7 +96,7 @@ def train_parser() -> argparse.ArgumentParser:
     offline(
         "-conf",
         "--conf-file",
-        help="the packaged settings of the paper if not given, 'small' for those of a 2-core machine; "
+        help="the packaged settings if not given, 'paper' for those of the method's paper; "
         "else a YAML file or a Python package, as in RL-Zoo",
     )
     offline(

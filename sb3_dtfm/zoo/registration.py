@@ -19,7 +19,7 @@ ONLINE = "dtfm"
 # Where settings of the online algorithms are.
 FINETUNING_CONFIGS = "sb3_dtfm.zoo_configs.finetune"
 # What `--conf-file` accepts besides files and Python packages; None is no `--conf-file` at all.
-PACKAGED_CONFIGS = {None: "sb3_dtfm.zoo_configs", "small": "sb3_dtfm.zoo_configs.small"}
+PACKAGED_CONFIGS = {None: "sb3_dtfm.zoo_configs", "paper": "sb3_dtfm.zoo_configs.paper"}
 
 
 def register() -> None:
@@ -39,7 +39,7 @@ def packaged_config(algo: str, name: str | None = None) -> Path:
     Hyperparameter file that comes with the package.
 
     :param algo: a key of `ALGORITHMS`; DT's settings, which are those of the trunk, serve a head without a file of its own
-    :param name: None for the paper's settings, "small" for those of a 2-core machine
+    :param name: None for the recommended settings, "paper" for those of the method's paper
     """
     folder = resources.files(PACKAGED_CONFIGS[name])
     own = Path(str(folder.joinpath(f"{algo}.yml")))
@@ -135,7 +135,6 @@ def _sample_trunk(trial: optuna.Trial) -> dict[str, Any]:
         "tokens_per_step": trial.suggest_categorical("tokens_per_step", [1, 3]),
         "chunk_size": trial.suggest_categorical("chunk_size", [1, 4, 8, 16]),
         "clip_return_to_go": trial.suggest_categorical("clip_return_to_go", [True, False]),
-        "average_return_to_go": trial.suggest_categorical("average_return_to_go", [True, False]),
         "film_return_to_go": trial.suggest_categorical("film_return_to_go", [True, False]),
         "calm_units": trial.suggest_categorical("calm_units", [True, False]),
     }

@@ -4,18 +4,19 @@ Record the data sets of the suite, which `studies/suite.yml` lists.
     python studies/suite/record.py --shared SHARED               # all of them, about an hour on two cores
     python studies/suite/record.py --shared SHARED --only Hopper # those whose command or name holds a word
 
-SHARED is a folder with `agents/` (trained agents) and `data/` (demonstrations by people). Other agents are trained here first,
-by Stable-Baselines3. A data set that is there already is left alone. Minari writes where MINARI_DATASETS_PATH says, everything
-else goes to `datasets/`.
+SHARED is a folder with `agents/` (trained agents) and `data/` (demonstrations by people). Other agents are trained here
+first, by Stable-Baselines3. A data set that is there already is left alone. Minari writes where MINARI_DATASETS_PATH says,
+everything else goes to `datasets/`.
 """
 
 import argparse
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 DATASETS = Path("datasets")
@@ -37,7 +38,7 @@ class Agent(NamedTuple):
     algo: str
     env_id: str
     n_steps: int
-    settings: dict[str, Any] = {}
+    settings: Mapping[str, Any] = MappingProxyType({})
     kept_at: tuple[int, ...] = ()
 
 

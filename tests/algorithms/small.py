@@ -6,7 +6,7 @@ import numpy as np
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from sb3_dtfm import DT, DTFM
-from tests.conftest import TINY_FLOW_POLICY, TINY_POLICY
+from tests.conftest import PLAIN, TINY_FLOW_POLICY, TINY_POLICY
 
 TINY = {DT: TINY_POLICY, DTFM: TINY_FLOW_POLICY}
 
@@ -14,7 +14,9 @@ TINY = {DT: TINY_POLICY, DTFM: TINY_FLOW_POLICY}
 def make_model(algorithm, buffer, **kwargs):
     """A tiny model; `policy_kwargs` are added to the tiny ones."""
     policy_kwargs = {**TINY[algorithm], **kwargs.pop("policy_kwargs", {})}
-    arguments: dict[str, Any] = dict(batch_size=16, context_length=5, seed=0, device="cpu", policy_kwargs=policy_kwargs)
+    arguments: dict[str, Any] = dict(
+        PLAIN, batch_size=16, context_length=5, seed=0, device="cpu", policy_kwargs=policy_kwargs
+    )
     return algorithm("MultiInputPolicy", dataset=buffer, **{**arguments, **kwargs})
 
 

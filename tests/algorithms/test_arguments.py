@@ -40,7 +40,8 @@ REFUSED_OF_THE_POLICY = {
     "chunk_size": (0, 2.5),
     "n_action_steps": (0, 2, 1.5),
     "clip_return_to_go": ("no", None),
-    "average_return_to_go": ("no", 1),
+    "return_scaling": ("mean", 1),
+    "return_conditioning": ("no", 1),
     "film_return_to_go": ("no", None),
     "calm_units": ("no", 1),
     "kv_cache": ("no", 1),
@@ -48,7 +49,7 @@ REFUSED_OF_THE_POLICY = {
 REFUSED_OF_THE_FLOW = {
     "flow_hidden_dim": (0, 2.5),
     "flow_n_layers": (0, 2.5),
-    "n_solver_steps": (0, 2.5),
+    "n_solver_steps": (-1, 2.5),
     "flow_tau_exponent": (0, NAN),
     "flow_prediction": ("noise",),
     "solver": ("leapfrog",),
@@ -147,7 +148,8 @@ def test_an_unknown_argument_of_the_policy_is_refused_with_those_accepted(algori
         "tokens_per_step",
         "chunk_size",
         "n_action_steps",
-        "average_return_to_go",
+        "return_scaling",
+        "return_conditioning",
         "film_return_to_go",
         "calm_units",
     }
@@ -165,7 +167,7 @@ NUMPY = dict(
 NUMPY_POLICY = dict(
     embed_dim=np.int64(16), n_layers=np.int64(1), n_heads=np.int32(2), dropout=np.float32(0.1),
     timestep_embedding=np.False_, tokens_per_step=np.int64(1), kv_cache=np.True_,
-    chunk_size=np.int64(3), n_action_steps=np.int64(2), average_return_to_go=np.True_, film_return_to_go=np.True_,
+    chunk_size=np.int64(3), n_action_steps=np.int64(2), return_conditioning=np.True_, film_return_to_go=np.True_,
     calm_units=np.True_,
 )  # fmt: skip
 NUMPY_FLOW = dict(

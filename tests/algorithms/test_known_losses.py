@@ -8,10 +8,13 @@ from gymnasium import spaces
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 
-TRUNK = dict(embed_dim=128, n_layers=3, n_heads=2, dropout=0.0, clip_return_to_go=True, timestep_embedding=False)
+TRUNK = dict(
+    embed_dim=128, n_layers=3, n_heads=2, dropout=0.0, tokens_per_step=3, timestep_embedding=False, return_scaling="max",
+    clip_return_to_go=False, film_return_to_go=False, calm_units=False,
+)  # fmt: skip
 HEADS = {
     DT: {},
-    DTFM: dict(flow_hidden_dim=256, flow_prediction="action", flow_tau_exponent=2.0, n_solver_steps=1, one_step=False),
+    DTFM: dict(flow_hidden_dim=256, flow_prediction="action", flow_tau_exponent=2.0, n_solver_steps=1, regression_coef=0.0),
 }
 # Of every sixth of 30 gradient steps, and the acting policy's action_mse after them.
 KNOWN = {

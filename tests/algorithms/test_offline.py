@@ -20,7 +20,7 @@ from torch.nn import functional as F
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import DatasetError, ScoreReference, TrajectoryBuffer, expected
 from sb3_dtfm.data.cache import Fingerprint, load_cached
-from tests.conftest import TINY_FLOW_POLICY, TINY_POLICY, make_env, record_random_episodes
+from tests.conftest import PLAIN, TINY_FLOW_POLICY, TINY_POLICY, make_env, record_random_episodes
 
 ALGORITHMS = [(DT, TINY_POLICY), (DTFM, TINY_FLOW_POLICY)]
 IDS = ["dt", "dtfm"]
@@ -28,7 +28,7 @@ IDS = ["dt", "dtfm"]
 
 def make_model(algorithm, buffer, **kwargs):
     policy_kwargs = kwargs.pop("policy_kwargs", dict(ALGORITHMS)[algorithm])
-    arguments = dict(batch_size=16, context_length=5, seed=0, policy_kwargs=policy_kwargs)
+    arguments = dict(PLAIN, batch_size=16, context_length=5, seed=0, policy_kwargs=policy_kwargs)
     return algorithm("MultiInputPolicy", dataset=buffer, **{**arguments, **kwargs})
 
 
@@ -48,7 +48,7 @@ def test_one_episode_is_learned_by_heart(algorithm, policy_kwargs):
     model = make_model(
         algorithm, buffer, policy_kwargs=overfit, learning_rate=2e-3, learning_rate_schedule="cosine", warmup_steps=50,
         weight_decay=0.0, batch_size=32, context_length=10, precision="float32", max_grad_norm=1.0,
-    ).learn(900 if algorithm is DTFM else 400)  # fmt: skip
+    ).learn(900)  # fmt: skip
     returns_to_go, state = buffer.returns_to_go.numpy(), None
     for t in range(len(episode)):
         observation = {

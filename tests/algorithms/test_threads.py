@@ -2,10 +2,12 @@
 
 import pytest
 import torch as th
+import yaml
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_dtfm import DTFM
 from sb3_dtfm.optimization import ONE_THREADS_PRODUCTS, threads_that_pay
+from sb3_dtfm.zoo.registration import packaged_config
 
 
 @pytest.mark.parametrize(
@@ -25,11 +27,12 @@ def test_little_work_is_done_by_one_thread_unless_the_user_says_how_many(n_produ
         th.set_num_threads(before)
 
 
-def test_the_packaged_small_profile_is_little_work_and_the_papers_is_not(cheetah_buffer):
+def test_the_default_is_little_work_and_the_papers_settings_are_not(cheetah_buffer):
     """Multiplications of a gradient step, as torch counts half of its floating-point operations."""
-    sizes = dict(embed_dim=128, n_layers=3, tokens_per_step=1, flow_hidden_dim=128, one_step=False, dropout=0.0)
-    for large, settings, context in ((False, sizes, {"context_length": 5}), (True, {}, {})):
-        model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, batch_size=64, policy_kwargs=settings, **context)
+    paper = yaml.safe_load(packaged_config("dtfm", "paper").read_text())["default"]
+    del paper["n_timesteps"]
+    for large, settings in ((False, {"policy": "MultiInputPolicy"}), (True, {**paper, "precision": "float32"})):
+        model = DTFM(dataset=cheetah_buffer, **settings)
         with FlopCounterMode(display=False) as counter:
             model.learn(1)
         assert model._n_products() == pytest.approx(counter.get_total_flops() / 2, rel=0.25)

@@ -16,7 +16,7 @@ ON_POLICY = dict(n_steps=4)
 QUICK = {SAC: OFF_POLICY, PPO: dict(**ON_POLICY, batch_size=4, n_epochs=1), A2C: ON_POLICY}
 
 
-UNITS = {"average_return_to_go": True, "calm_units": True}
+UNITS = {"return_scaling": "timestep", "calm_units": True}
 CASES = {"single": UNITS, "plans": {**CHUNKS, "n_action_steps": 1}, "cached": {"kv_cache": True}}
 
 

@@ -57,7 +57,7 @@ def make_venv(lengths=(7, 10, 4), for_good=(False, True, False), vec_env_cls=Dum
 
 @pytest.fixture(params=[{}, CHUNKS, {**CHUNKS, "kv_cache": True}], ids=["single", "chunks", "cached"])
 def model(request, cheetah_buffer):
-    policy_kwargs = {"average_return_to_go": True, "calm_units": True, **request.param}
+    policy_kwargs = {"return_scaling": "timestep", "calm_units": True, **request.param}
     return make_model(DTFM, cheetah_buffer, ema_decay=0.9, policy_kwargs=policy_kwargs).learn(5)
 
 

@@ -31,8 +31,8 @@ def test_a_predicted_action_is_where_every_solver_ends(solver, n_solver_steps):
     head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_prediction="action")
     action = th.tensor([0.3, -0.8])
     with th.no_grad():
-        head.regression.weight.zero_()
-        head.regression.bias.copy_(action.atanh())
+        head.regression.linear.weight.zero_()
+        head.regression.linear.bias.copy_(action.atanh())
         th.testing.assert_close(head.solve(th.randn(5, 4), th.randn(5, 2), solver, n_solver_steps), action.expand(5, 2))
 
 
@@ -51,13 +51,13 @@ def test_the_loss_is_the_mean_over_valid_steps(prediction):
         if prediction == "velocity":
             error = output - (actions[row, step] - noise[row, step])
         else:
-            error = (head.regression(hidden[row, step]) + output).tanh() - actions[row, step]
+            error = (head.regression.linear(hidden[row, step]) + output).tanh() - actions[row, step]
         by_hand.append(error.square().mean())
     th.testing.assert_close(head.flow_loss(hidden, actions, mask, noise, tau), th.stack(by_hand).mean())
 
 
 def test_taus_are_spread_evenly_from_a_random_start_and_taken_in_turn():
-    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8)
+    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_tau_exponent=1.0)
     generator = th.Generator().manual_seed(0)
     noise, tau = head.draw_noise(th.zeros(50, 20, 2), generator)
     assert (noise.shape, tau.shape) == ((50, 20, 2), (50, 4))
@@ -75,7 +75,7 @@ def test_taus_are_spread_evenly_from_a_random_start_and_taken_in_turn():
 def test_a_predicted_action_stays_within_the_bounds(n_solver_steps):
     head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_prediction="action")
     with th.no_grad():
-        head.regression.weight.mul_(1000.0)
+        head.regression.linear.weight.mul_(1000.0)
         actions = head.solve(10 * th.randn(500, 4), th.randn(500, 2), "euler", n_solver_steps)
     assert 0.9 < actions.abs().max() < 1.0 + 1e-6
 
@@ -98,7 +98,7 @@ def test_paths_lead_from_the_noise_to_the_actions(prediction):
 
 def test_a_head_that_predicts_actions_starts_as_decision_transformers():
     head, regression = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_prediction="action"), RegressionHead(4, 2)
-    regression.linear.load_state_dict(head.regression.state_dict())
+    regression.load_state_dict(head.regression.state_dict())
     hidden, actions, mask = th.randn(3, 5, 4), th.rand(3, 5, 2), th.ones(3, 5, dtype=th.bool)
     noise, tau = th.randn(3, 5, 2), th.rand(3, 5)
     expected, _ = regression.loss(hidden, actions, mask)
@@ -107,7 +107,7 @@ def test_a_head_that_predicts_actions_starts_as_decision_transformers():
 
 
 def test_its_one_step_network_starts_so_too_and_leaves_the_regression_alone():
-    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_prediction="action")
+    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_prediction="action", one_step=True)
     hidden, noise = th.randn(3, 4), th.randn(3, 2)
     th.testing.assert_close(head.one_step_action(hidden, noise), head.solve(hidden, noise, "euler", 1))
     nn.init.normal_(head.vector_field.output.weight)
@@ -118,7 +118,7 @@ def test_its_one_step_network_starts_so_too_and_leaves_the_regression_alone():
 
 @pytest.mark.parametrize(("n_solver_steps", "expected"), [(3, 3), (50, 16)])
 def test_the_one_step_network_learns_where_the_solver_of_the_settings_ends(n_solver_steps, expected):
-    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, n_solver_steps=n_solver_steps)
+    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, n_solver_steps=n_solver_steps, one_step=True)
     head.n_solver_steps = 1  # as it acts later changes nothing
     hidden, noise = th.randn(3, 4), th.randn(3, 2)
     error = head.one_step_action(hidden, noise) - head.solve(hidden, noise, "euler", expected).clamp(-1.0, 1.0)
@@ -126,9 +126,27 @@ def test_the_one_step_network_learns_where_the_solver_of_the_settings_ends(n_sol
     th.testing.assert_close(loss, error.square().mean())
 
 
+def test_the_mean_action_and_the_hidden_state_are_learned_by_the_regression_alone():
+    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, n_solver_steps=0)
+    assert not head.noise_decides
+    nn.init.normal_(head.vector_field.output.weight)
+    hidden, actions, mask = th.randn(3, 5, 4, requires_grad=True), th.rand(3, 5, 2), th.ones(3, 5, dtype=th.bool)
+    head.loss(hidden, actions, mask, th.randn(3, 5, 2), th.rand(3, 5))[0].backward()
+    learned = (hidden, head.regression.linear.weight)
+    expected = th.autograd.grad(head.regression.loss(hidden, actions, mask)[0], learned)
+    th.testing.assert_close(tuple(each.grad for each in learned), expected)
+    assert head.vector_field.output.weight.grad.abs().max() > 0
+    assert head(hidden, th.randn(3, 5, 2)).equal(head.regression(hidden))
+
+
+def test_the_mean_action_needs_a_regression():
+    with pytest.raises(ValueError, match=r"n_solver_steps=0 needs .*regression_coef"):
+        FlowHead(embed_dim=4, action_dim=2, n_solver_steps=0, regression_coef=0.0)
+
+
 def test_parts_of_the_loss_add_up():
     """Flow, auxiliary regression by its weight, and the one-step network."""
-    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, regression_coef=0.5)
+    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, regression_coef=0.5, one_step=True)
     hidden, actions, mask = th.randn(3, 5, 4), th.rand(3, 5, 2), th.ones(3, 5, dtype=th.bool)
     loss, parts = head.loss(hidden, actions, mask, th.randn(3, 5, 2), th.rand(3, 5))
     assert set(parts) == {"flow_loss", "regression_loss", "one_step_loss"}
@@ -139,7 +157,8 @@ def test_parts_of_the_loss_add_up():
 def test_a_flow_head_learns_two_modes_that_regression_would_average(prediction):
     th.manual_seed(0)
     generator = th.Generator().manual_seed(0)
-    head = FlowHead(embed_dim=4, action_dim=1, flow_hidden_dim=64, flow_n_layers=2, flow_prediction=prediction)
+    sizes = dict(embed_dim=4, action_dim=1, flow_hidden_dim=64, flow_n_layers=2)
+    head = FlowHead(**sizes, flow_prediction=prediction, one_step=True)
     optimizer = th.optim.Adam(head.parameters(), 3e-3)
     hidden, mask = th.zeros(256, 1, 4), th.ones(256, 1, dtype=th.bool)
     for _ in range(400):

@@ -13,7 +13,7 @@ from sb3_dtfm.policies import DTFMPolicy
 from tests.conftest import TINY_FLOW_POLICY, TINY_POLICY, make_env
 
 ALGORITHMS = [(DT, TINY_POLICY), (DTFM, TINY_FLOW_POLICY)]
-ONE_TOKEN_OPTIONS = {"tokens_per_step": 1, "film_return_to_go": True, "average_return_to_go": True}
+ONE_TOKEN_OPTIONS = {"tokens_per_step": 1, "film_return_to_go": True, "return_scaling": "timestep"}
 ONE_TOKEN = [(algorithm, {**policy_kwargs, **ONE_TOKEN_OPTIONS}) for algorithm, policy_kwargs in ALGORITHMS]
 CHUNKS = [(algorithm, {**policy_kwargs, "chunk_size": 4, "n_action_steps": 3}) for algorithm, policy_kwargs in ONE_TOKEN]
 UNGUIDED = {"n_candidates": 1, "candidate_noise": 1.0, "temperature": 0.0}

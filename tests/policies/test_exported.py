@@ -29,7 +29,7 @@ EVERYTHING = {
     **CHUNKS,
     "tokens_per_step": 1,
     "film_return_to_go": True,
-    "average_return_to_go": True,
+    "return_scaling": "timestep",
     "clip_return_to_go": True,
     "calm_units": True,
     "timestep_embedding": False,

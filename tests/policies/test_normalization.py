@@ -34,22 +34,30 @@ def test_observations_by_hand(observations, expected):
 
 
 @pytest.mark.parametrize(
-    ("return_to_go", "timestep", "summed", "average"),
-    [(300.0, 0, 1.0, 1.0), (150.0, 50, 0.5, 1.0), (3.0, 99, 0.01, 1.0), (60.0, 80, 0.2, 1.0), (6.0, 140, 0.02, 2.0)],
-    ids=["at the start", "half-way", "last step", "all along the same", "longer than any episode of the data"],
+    ("return_to_go", "timestep", "expected"),
+    [(300.0, 0, 0.5), (150.0, 50, 0.5), (75.0, 50, -0.25), (3.0, 99, 0.5), (9000.0, 0, 1.25), (6.0, 140, 1.25)],
+    ids=["at the start", "half-way", "below the mean", "last step", "clipped at five deviations", "longer than any episode"],
 )
-def test_the_average_return_to_go_by_hand(return_to_go, timestep, summed, average):
+def test_the_scaled_return_to_go_by_hand(return_to_go, timestep, expected):
+    """Two standard deviations above the mean at a time step are 0.5, at the first step as at the last."""
+    normalization = make_normalization(return_scaling="timestep")
+    remaining = th.arange(T, 0, -1) / T
+    normalization.set_return_to_go_moments(th.stack((200.0 * remaining, 50.0 * remaining)))
     windows = make_windows([1.0, 5.0], return_to_go, timestep)
-    for options, expected in (({}, summed), ({"average_return_to_go": True}, average)):
-        assert make_normalization(**options)(windows).returns_to_go.item() == pytest.approx(expected)
+    assert normalization(windows).returns_to_go.item() == pytest.approx(expected)
 
 
-def test_an_average_return_to_go_is_clipped_as_the_sum_is():
-    normalization = make_normalization(average_return_to_go=True, clip_return_to_go=True)
+def test_a_return_to_go_is_clipped_before_it_is_scaled():
+    normalization = make_normalization(return_scaling="timestep", clip_return_to_go=True)
+    normalization.set_return_to_go_moments(th.stack((th.full((T,), 100.0), th.full((T,), 25.0))))
     limits = th.zeros(2, T)
     limits[1] = 150.0
     normalization.set_return_to_go_range(limits)
-    assert normalization(make_windows([1.0, 5.0], 900.0, 50)).returns_to_go.item() == pytest.approx(1.0)
+    assert normalization(make_windows([1.0, 5.0], 900.0, 50)).returns_to_go.item() == pytest.approx(0.5)
+
+
+def test_a_policy_without_return_conditioning_sees_none():
+    assert make_normalization(return_scaling=None)(make_windows([1.0, 5.0], 900.0, 50)).returns_to_go.item() == 0.0
 
 
 def test_the_unit_is_the_standard_deviation_unless_asked_for():

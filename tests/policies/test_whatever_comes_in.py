@@ -103,7 +103,7 @@ def test_numbers_of_any_type_are_the_same_numbers(key, model):
 
 @pytest.mark.parametrize("algorithm", [DT, DTFM])
 @pytest.mark.parametrize(
-    "policy_kwargs", [dict(), dict(average_return_to_go=True, film_return_to_go=True, tokens_per_step=1)]
+    "policy_kwargs", [dict(), dict(return_scaling="timestep", film_return_to_go=True, tokens_per_step=1)]
 )
 def test_huge_numbers_have_finite_actions_inside_the_space(algorithm, policy_kwargs, cheetah_buffer):
     model = make_model(algorithm, cheetah_buffer, policy_kwargs=policy_kwargs)

@@ -35,13 +35,13 @@ def test_several_datasets_are_a_list():
 
 
 @pytest.mark.parametrize("algo", ["dt", "dtfm"])
-def test_conf_file_defaults_to_the_paper_and_small_is_packaged(algo):
+def test_conf_file_defaults_to_the_packaged_one_and_paper_is_packaged(algo):
     assert zoo_reads(train_arguments(["--algo", algo, *ENV])).conf_file == str(packaged_config(algo))
-    assert zoo_reads(train_arguments(["--algo", algo, *ENV, "-conf", "small"])).conf_file == str(
-        packaged_config(algo, "small")
+    assert zoo_reads(train_arguments(["--algo", algo, *ENV, "-conf", "paper"])).conf_file == str(
+        packaged_config(algo, "paper")
     )
     assert packaged_config(algo).parent.name == "zoo_configs"
-    assert packaged_config(algo, "small").parent.name == "small"
+    assert packaged_config(algo, "paper").parent.name == "paper"
 
 
 def test_any_other_conf_file_stays():

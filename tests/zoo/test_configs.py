@@ -26,17 +26,7 @@ TARGETS = {
     "robosuite/Square-v0": 1,
 }
 HEAD_KEYS = set(HEADS["DTFM"].options())
-SETTINGS = [None, "small"]
-# As the rows in results/ were trained.
-SMALL_STEPS = {
-    "HalfCheetah-v5": 8000,
-    "Walker2d-v5": 2500,
-    "Ant-v5": 2500,
-    "Humanoid-v5": 2500,
-    "robosuite/Lift-v0": 1200,
-    "robosuite/Can-v0": 2000,
-    "robosuite/Square-v0": 6000,
-}
+SETTINGS = [None, "paper"]
 
 
 def load(algo: str, settings: str | None) -> dict:
@@ -63,12 +53,13 @@ def test_every_task_builds_its_model(env_id, settings):
         hyperparams = load(algo, settings)[env_id]
         wrapped = get_wrapper_class(hyperparams)(env)
         assert wrapped.get_wrapper_attr("target_return") == TARGETS[env_id]
-        assert hyperparams.pop("n_timesteps") == (150_000 if settings is None else SMALL_STEPS[env_id])
+        n_steps = hyperparams.pop("n_timesteps")
+        assert n_steps == 150_000 if settings == "paper" else n_steps <= 8000
         assert isinstance(hyperparams.pop("dataset"), str)
         del hyperparams["env_wrapper"]
         model = algorithm(env=wrapped, dataset=buffer, device="cpu", **hyperparams)
         assert isinstance(model.learning_rate, float)
-        assert model.batch_size == hyperparams["batch_size"]
+        assert model.batch_size == 256
     env.close()
 
 
@@ -77,20 +68,31 @@ def test_dt_and_dtfm_differ_in_the_head_only(settings):
     dt, dtfm = load("dt", settings), copy.deepcopy(load("dtfm", settings))
     assert set(dt) == {"default", *TARGETS}
     for hyperparams in dtfm.values():
-        for key in HEAD_KEYS & set(hyperparams["policy_kwargs"]):
+        for key in HEAD_KEYS & set(hyperparams.get("policy_kwargs", {})):
             del hyperparams["policy_kwargs"][key]
     assert dt == dtfm
 
 
 def test_the_papers_settings():
-    default = load("dtfm", None)["default"]
+    default = load("dtfm", "paper")["default"]
     assert default["policy_kwargs"] == {
         "embed_dim": 256,
         "n_layers": 10,
         "n_heads": 2,
         "dropout": 0.1,
+        "tokens_per_step": 3,
+        "timestep_embedding": True,
+        "chunk_size": 1,
+        "return_scaling": "max",
+        "clip_return_to_go": False,
+        "film_return_to_go": False,
+        "calm_units": False,
         "flow_hidden_dim": 512,
         "flow_n_layers": 3,
+        "flow_prediction": "velocity",
+        "flow_tau_exponent": 1.0,
+        "regression_coef": 0.0,
+        "one_step": True,
         "solver": "euler",
         "n_solver_steps": 50,
     }
@@ -102,8 +104,18 @@ def test_the_papers_settings():
         "batch_size": 256,
         "learning_rate": 1e-4,
         "learning_rate_schedule": "constant",
+        "warmup_steps": 0,
         "weight_decay": 1e-3,
+        "ema_decay": 0.0,
+        "return_weight": 0.0,
+        "precision": "auto",
     }
+
+
+def test_the_packaged_settings_name_data_and_steps_only():
+    """All else is the class's default, or decided from the data."""
+    for entry in load("dtfm", None).values():
+        assert set(entry) <= {"policy", "n_timesteps", "dataset", "env_wrapper"}
 
 
 @pytest.mark.filterwarnings("error")  # Optuna only warns of a value outside of the range
@@ -112,14 +124,18 @@ def test_the_papers_settings():
 def test_a_search_can_find_the_packaged_settings(algo, settings):
     """A trial's `policy_kwargs` replace the YAML's, so what the search leaves out there would be lost."""
     register()
-    policy = policy_of(algo)
-    defaults = {name: parameter.default for name, parameter in inspect.signature(policy).parameters.items()}
+    policy, algorithm = policy_of(algo), ALGORITHMS[algo]
+    defaults = {
+        name: parameter.default
+        for each in (algorithm, policy)
+        for name, parameter in inspect.signature(each).parameters.items()
+    }
     defaults.update(policy.head_class.options())
     for hyperparams in load(algo, settings).values():
-        policy_kwargs = copy.copy(hyperparams["policy_kwargs"])
-        for key in {"solver", "one_step"} & set(policy_kwargs):  # not searched for: neither changes what the rest learns
+        policy_kwargs = copy.copy(hyperparams.get("policy_kwargs", {}))
+        for key in {"solver", "one_step", "return_scaling", "regression_coef"} & set(policy_kwargs):  # not searched for
             del policy_kwargs[key]
-        packaged = {"ema_decay": 0.0, **defaults, **hyperparams, **policy_kwargs}
+        packaged = {**defaults, **hyperparams, **policy_kwargs}
         powers = {f"{key}_pow": int(np.log2(value)) for key, value in packaged.items() if type(value) is int and value > 0}
         sampled = HYPERPARAMS_SAMPLER[algo](optuna.trial.FixedTrial({**packaged, **powers}), 0, 1, {})
         assert sampled.pop("policy_kwargs").items() >= policy_kwargs.items()
