@@ -52,10 +52,10 @@ def plan_ratio(buffer: TrajectoryBuffer) -> float:
     """
     How much better the previous action predicts an action than the observation does, on episodes held out.
 
-    People and scripts follow plans that an observation does not show: repeating the last action is the better guess. Agents of
-    reinforcement learning compute each action from the observation: a regression is the better guess. Chunks of actions drawn
-    from the flow copy a plan; the mean action leaves out an agent's noise. Of 30 data sets the ratio was below 0.8 for agents
-    and above 1.6 for people, scripts and planners, but for Adroit's door, 0.7 to 1.5.
+    People and scripts follow plans that an observation does not show: repeating the last action is the better guess. Agents
+    of reinforcement learning compute each action from the observation: a regression is the better guess. Chunks of actions
+    drawn from the flow copy a plan; the mean action leaves out an agent's noise. Of 30 data sets the ratio was below 0.8 for
+    agents and above 1.6 for people, scripts and planners, but for Adroit's door, 0.7 to 1.5.
 
     :param buffer: Box actions
     :return: mean squared error of ridge regression (on the observation and 512 random features of it) over that of the last
