@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 # Paths in a picture of the flow, and how far it reaches: what little noise lies beyond only makes the rest small.
 N_PATHS, REACH = 300, 2.2
 # Of the first gradient steps, that the time of the others is told by: at least so many, and so many seconds.
-N_TIMED, SECONDS_TIMED = 10, 5.0
+N_TIMED, SECONDS_TIMED = 3, 5.0
 # Seconds to train from which on silence would be a surprise.
 LONG = 1800.0
 
@@ -68,8 +68,8 @@ class TimeLeft(BaseCallback):
         device = "CPU" if self.model.device.type == "cpu" else "GPU"
         left = f"About {_duration(seconds)} left on this {device} ({_two_digits(rate)} gradient steps a second)."
         if seconds > LONG:
-            remedy = "Fewer total_timesteps, or a smaller batch_size, context_length, embed_dim or n_layers, take less."
-            warnings.warn(f"{left} {remedy}", UserWarning, stacklevel=2)
+            remedy = "To shorten it, lower total_timesteps, batch_size, context_length, embed_dim or n_layers."
+            warnings.warn(f"{left} {remedy}", UserWarning, stacklevel=7)  # the line that calls `learn`
         elif self.model.verbose >= 1:
             print(left, flush=True)
 
