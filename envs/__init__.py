@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         flatten_observation_space,
         known_task,
         return_to_go_space,
+        share_target_return,
     )
 
 register_robosuite_envs()
@@ -32,6 +33,7 @@ __all__ = [
     "register_gymnasium_robotics",
     "register_robosuite_envs",
     "return_to_go_space",
+    "share_target_return",
 ]
 
 

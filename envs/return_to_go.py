@@ -119,17 +119,18 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     `EvalCallback` and logs know.
 
     :param env: the environment to wrap
-    :param target_return: return to ask for in each episode, environment reward units
+    :param target_return: return to ask for in each episode, environment reward units; None takes that of the model which the
+        environment is given to
     :raises ValueError: `target_return` is not a finite number, or the observation space cannot be flattened
     """
 
-    def __init__(self, env: gym.Env, target_return: float) -> None:
+    def __init__(self, env: gym.Env, target_return: float | None = None) -> None:
         RecordConstructorArgs.__init__(self, target_return=target_return)
         super().__init__(env)
-        self.target_return = check_target_return(target_return)
+        self.target_return = None if target_return is None else check_target_return(target_return)
         self.observation_space = return_to_go_space(env.observation_space)
         self._sorted_space = sort_observation_space(env.observation_space)
-        self._return_to_go = self.target_return
+        self._return_to_go = math.nan
         self._timestep = 0
 
     @property
@@ -149,6 +150,14 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """
+        :raises ValueError: there is no target return yet
+        """
+        if self.target_return is None:
+            raise ValueError(
+                "ReturnToGoWrapper(env) has no target return yet: give it to a model, DTFM(..., env=env) or "
+                "model.set_env(env), or write ReturnToGoWrapper(env, target_return=model.target_return)."
+            )
         observation, info = self.env.reset(seed=seed, options=options)
         self._return_to_go = self.target_return
         self._timestep = 0
@@ -187,10 +196,17 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         }
 
 
-def check_vec_env(env: VecEnv) -> None:
+def check_vec_env(
+    env: VecEnv,
+    name: str = "The environment",
+    remedy: str = "make_vec_env(env_id, n_envs, wrapper_class=ReturnToGoWrapper)",
+) -> None:
     """
     Make sure that return-to-go and time step reach the policy unharmed.
 
+    :param env: the environment
+    :param name: of it, for messages
+    :param remedy: the line that wraps it, for messages
     :raises ValueError: no :class:`ReturnToGoWrapper` inside, or normalised or stacked observations
     """
     vec_normalize = unwrap_vec_normalize(env)
@@ -203,8 +219,8 @@ def check_vec_env(env: VecEnv) -> None:
         raise ValueError("VecFrameStack would mix up return_to_go and timestep; set context_length instead.")
     if set(getattr(env.observation_space, "spaces", {})) != {OBSERVATION, RETURN_TO_GO, TIMESTEP}:
         raise ValueError(
-            "The environment must be wrapped in sb3_dtfm.envs.ReturnToGoWrapper(env, target_return=...), inside any "
-            f"vectorised environment; its observation space is {env.observation_space}."
+            f"{name} must be wrapped in sb3_dtfm.envs.ReturnToGoWrapper, inside any vectorised environment: write {remedy}. "
+            f"Its observation space is {env.observation_space}."
         )
 
 
@@ -212,3 +228,19 @@ def known_task(env: VecEnv) -> Task | None:
     """What Gymnasium knows of the task behind a :class:`ReturnToGoWrapper`; None of one that is not registered."""
     (task,) = env.get_attr("known_task", indices=0)
     return task
+
+
+def share_target_return(env: VecEnv, target_return: float | None) -> float | None:
+    """
+    Have each :class:`ReturnToGoWrapper` without a target ask for this return.
+
+    :param env: wrapped inside
+    :param target_return: environment reward units; None takes the first target that there is
+    :return: what it is, None where nobody knows
+    """
+    targets = env.get_attr("target_return")
+    if target_return is None:
+        target_return = next((each for each in targets if each is not None), None)
+    if target_return is not None:
+        env.env_method("set_target_return", target_return, indices=[i for i, each in enumerate(targets) if each is None])
+    return target_return

@@ -1,5 +1,7 @@
 """What the learn loop adds to Stable-Baselines3's own callbacks."""
 
+import time
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import torch as th
@@ -13,6 +15,10 @@ if TYPE_CHECKING:
 
 # Paths in a picture of the flow, and how far it reaches: what little noise lies beyond only makes the rest small.
 N_PATHS, REACH = 300, 2.2
+# Of the first gradient steps, that the time of the others is told by: at least so many, and so many seconds.
+N_TIMED, SECONDS_TIMED = 3, 5.0
+# Seconds to train from which on silence would be a surprise.
+LONG = 1800.0
 
 
 def find_eval_callbacks(callback: BaseCallback | None) -> list[EvalCallback]:
@@ -32,6 +38,49 @@ class GradientStepProgressBar(ProgressBarCallback):
     def _on_step(self) -> bool:
         self.pbar.update(1)
         return True
+
+
+class TimeLeft(BaseCallback):
+    """
+    Say once, after the first gradient steps, how long the others take; more than half an hour is a warning, whatever
+    `verbose` is. The very first step is not timed, since it may compile. Put it behind the callbacks that evaluate.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._start: tuple[int, float] | None = None  # gradient steps and time, after the first one
+        self._has_spoken = False
+
+    def _on_step(self) -> bool:
+        if self._has_spoken:
+            return True
+        now = time.perf_counter()
+        self._start = self._start or (self.num_timesteps, now)
+        n_steps, seconds = self.num_timesteps - self._start[0], now - self._start[1]
+        if n_steps >= N_TIMED and seconds >= SECONDS_TIMED:
+            self._has_spoken = True
+            self._speak(n_steps / seconds)
+        return True
+
+    def _speak(self, rate: float) -> None:
+        """:param rate: gradient steps a second"""
+        seconds = (self.model._total_timesteps - self.num_timesteps) / rate
+        device = "CPU" if self.model.device.type == "cpu" else "GPU"
+        left = f"About {_duration(seconds)} left on this {device} ({_two_digits(rate)} gradient steps a second)."
+        if seconds > LONG:
+            remedy = "To shorten it, lower total_timesteps, batch_size, context_length, embed_dim or n_layers."
+            warnings.warn(f"{left} {remedy}", UserWarning, stacklevel=7)  # the line that calls `learn`
+        elif self.model.verbose >= 1:
+            print(left, flush=True)
+
+
+def _duration(seconds: float) -> str:
+    unit, size = ("h", 3600) if seconds >= 5400 else ("min", 60) if seconds >= 90 else ("s", 1)
+    return f"{_two_digits(seconds / size)} {unit}"
+
+
+def _two_digits(number: float) -> str:
+    return f"{float(f'{number:.2g}'):,g}"
 
 
 class SeedEvaluations(BaseCallback):

@@ -74,6 +74,11 @@ class Context(NamedTuple):
     n_planned: np.ndarray
     keys_values: np.ndarray
 
+    def __repr__(self) -> str:
+        n_rows, n_steps = self.mask.shape
+        sizes = (f"{n} {what}{'s' if n != 1 else ''}" for n, what in ((n_rows, "row"), (n_steps, "step")))
+        return f"Context({', '.join(sizes)})"
+
     @property
     def windows(self) -> Windows:
         """The steps alone."""
@@ -230,7 +235,8 @@ def unpack_observation(observation: Any, observation_dim: int) -> tuple[tuple[np
         found = f"the keys {sorted(observation)}" if isinstance(observation, dict) else type(observation).__name__
         raise ValueError(
             f"The observation must be a dict with the keys {', '.join(OBSERVATION_KEYS)}, as "
-            f"sb3_dtfm.envs.ReturnToGoWrapper gives it; got {found}."
+            "sb3_dtfm.envs.ReturnToGoWrapper gives it: write ReturnToGoWrapper(env, target_return=model.target_return), or "
+            f"take model.get_env(); got {found}."
         )
     given = {key: _array(observation, key) for key in OBSERVATION_KEYS}
     shape = given["observation"].shape

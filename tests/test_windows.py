@@ -1,6 +1,7 @@
 """The context window against a plain list of steps."""
 
 import numpy as np
+import pytest
 
 from sb3_dtfm.windows import empty_context, push, with_action
 
@@ -43,3 +44,8 @@ def test_pushing_leaves_the_old_context_alone():
     copies = [array.copy() for array in old]
     with_action(push(old, *step(2.0, 1)), np.ones((1, 1), np.float32))
     assert all(np.array_equal(array, copy) for array, copy in zip(old, copies, strict=True))
+
+
+@pytest.mark.parametrize(("sizes", "shown"), [((1, 5), "1 row, 5 steps"), ((3, 1), "3 rows, 1 step")])
+def test_a_context_is_shown_by_its_sizes(sizes, shown):
+    assert repr(empty_context(*sizes, 17, 6)) == f"Context({shown})"

@@ -8,9 +8,12 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
 
+import gymnasium as gym
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.env_util import is_wrapped
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule, TensorDict
 from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv
@@ -31,8 +34,9 @@ from sb3_dtfm.arguments import (
 )
 from sb3_dtfm.data import Dataset, DatasetError, ScoreReference, TrajectoryBuffer, check_action_space, load_dataset
 from sb3_dtfm.data.decisions import Decision, decide
+from sb3_dtfm.data.inspection import suggest_target_return
 from sb3_dtfm.distributed import check_batch_size, first_of_each_machine_first, is_first_process
-from sb3_dtfm.envs import check_vec_env, known_task, return_to_go_space
+from sb3_dtfm.envs import ReturnToGoWrapper, check_vec_env, known_task, return_to_go_space, share_target_return
 from sb3_dtfm.files import ModelFile, file_name, holds_pickles, read_model, write_model, write_onnx
 from sb3_dtfm.optimization import LEARNING_RATE_SCHEDULES, PRECISIONS, RunningMeans
 from sb3_dtfm.policies import SequencePolicy
@@ -40,6 +44,8 @@ from sb3_dtfm.policies.exported import ExportedPolicy
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineAlgorithm")
 
+# The names of an algorithm's one policy: Stable-Baselines3's for dictionaries, which is what it observes, and for vectors.
+POLICY_NAMES = ("MultiInputPolicy", "MlpPolicy")
 ACCEPTED: dict[str, Rule] = {
     "batch_size": COUNT,
     "weight_decay": NOT_NEGATIVE,
@@ -56,6 +62,7 @@ ACCEPTED: dict[str, Rule] = {
     "precision": Choice(PRECISIONS),
     "compile": Choice((None, *BOOLEAN.values)),
     "seed": Number(low=0, whole=True, optional=True),
+    "target_return": Number(optional=True),
 }
 
 
@@ -63,8 +70,9 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
     """
     A model with the data it learns from: everything of an algorithm but its learn loop.
 
-    :param policy: "MultiInputPolicy" or a policy class
-    :param env: environment wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`; optional, never used for learning
+    :param policy: "MultiInputPolicy" (or "MlpPolicy", which is the same), or a policy class
+    :param env: environment, or its Gymnasium id; optional, never used for learning. It is wrapped in
+        :class:`~sb3_dtfm.envs.ReturnToGoWrapper` where it is not yet; a vectorised one has to be wrapped inside
     :param dataset: Minari id or dataset, path to a robomimic hdf5 file or to flat arrays (`.npz`, hdf5), or what is in
         memory: a dictionary of arrays, a list of episodes, an SB3 `ReplayBuffer`, a
         :class:`~sb3_dtfm.data.TrajectoryBuffer`; see :func:`~sb3_dtfm.data.load_dataset`
@@ -99,7 +107,10 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
     :param seed: seed of weights, batches and acting
     :param device: "auto", "cpu" or "cuda"
     :param _init_setup_model: build the network at once
-    :raises ValueError: no dataset, or an argument out of range
+    :ivar target_return: to ask for, environment reward units: the environment's, or where it has none the mean return of the
+        best tenth of the recorded episodes, which `sb3-dtfm inspect` suggests. It is saved with the model, and given to each
+        environment of the model that is wrapped without a target. None where a file does not tell
+    :raises ValueError: no dataset, an argument out of range, or an environment that does not fit
     :raises DatasetError: the dataset cannot be read, or does not fit the environment
     """
 
@@ -136,7 +147,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         _init_setup_model: bool = True,
     ) -> None:
         super().__init__(
-            policy,
+            self._get_policy_from_name(policy) if isinstance(policy, str) else policy,
             env,
             learning_rate,
             policy_kwargs=policy_kwargs,
@@ -148,8 +159,10 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
             seed=seed,
             supported_action_spaces=(spaces.Box, spaces.Discrete),
         )
+        self.target_return: float | None = None
         if self.env is not None:
             self._policy_class.head_for(self.action_space)  # before the data are read, which may take long
+            self.target_return = share_target_return(self.env, None)
         self.dataset = dataset
         self.batch_size = batch_size
         self.weight_decay = weight_decay
@@ -198,6 +211,15 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         self.decisions = [each for each in decide(buffer) if each.name in names]
         self.policy_kwargs = {**{each.name: each.value for each in self.decisions}, **given}
 
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        """
+        :raises ValueError: there is none of that name
+        """
+        if policy_name not in self.policy_aliases:
+            first, *others = map(repr, self.policy_aliases)
+            raise ValueError(f"policy must be {first} (or {', '.join(others)}), got {policy_name!r}.")
+        return self.policy_aliases[policy_name]
+
     def _check_arguments(self, learning_rate: Rule) -> None:
         """
         :param learning_rate: what a number may be that is given as such: 0 is for those who load a model to act with it
@@ -238,12 +260,28 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         if self.env is not None:
             self._check_task(buffer, self.env)
         buffer = buffer.random_fraction(self.dataset_fraction, self.dataset_seed)
+        if self.target_return is None:
+            self._take_target_return(suggest_target_return(buffer))
         if self.return_steps is not None:
             if self.verbose >= 1 and is_first_process():
                 print(f"Learning which returns may be expected (return_steps={self.return_steps})", flush=True)
             buffer = buffer.to("cpu").with_expected_returns(self.return_steps, self.dataset_seed)
         self.buffer = buffer.to(self.device)
         return self.buffer
+
+    def _take_target_return(self, target_return: float) -> None:
+        """
+        Have the model and its environment ask for what the data suggest.
+
+        :param target_return: environment reward units
+        """
+        self.target_return = target_return
+        if self.env is None:
+            return
+        share_target_return(self.env, target_return)
+        if self.verbose >= 1 and is_first_process():
+            what = "the mean return of the best tenth of the recorded episodes"
+            print(f"The environment asks for target_return={target_return:g}, {what}.", flush=True)
 
     def _check_spaces(self, observation_space: spaces.Space, action_space: ActionSpace, found: str, expected: str) -> None:
         """
@@ -304,10 +342,14 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         """
-        SB3's wrapping, then a check that return-to-go arrives unharmed and that actions can be learned.
+        SB3's wrapping, within it ours, then a check that return-to-go arrives unharmed and that actions can be learned.
 
         :raises ValueError: no return-to-go in the observation, normalised or stacked observations, or unbounded actions
         """
+        if isinstance(env, gym.Env) and not is_wrapped(env, ReturnToGoWrapper):
+            if verbose >= 1:
+                print("Wrapping the env in a ReturnToGoWrapper.")
+            env = ReturnToGoWrapper(env)
         vec_env = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         check_vec_env(vec_env)
         check_action_space(vec_env.action_space, "the environment")
@@ -318,7 +360,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         Act in another environment from now on.
 
         :param env: of the model's sizes and range of actions; the bounds of observations may differ, since the policy
-            normalises them itself
+            normalises them itself. It is wrapped as in the constructor, and asks for the model's `target_return` where it
+            has no target of its own
         :param force_reset: as in SB3
         :raises ValueError: it does not fit
         """
@@ -329,6 +372,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
             self._check_task(self.buffer, vec_env)
         self.observation_space, self.action_space = vec_env.observation_space, action_space
         self.n_envs = vec_env.num_envs
+        self.target_return = share_target_return(vec_env, self.target_return)
         super().set_env(vec_env, force_reset)
 
     @classmethod
@@ -423,7 +467,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
 
         :param path: file to write, for example "policy.onnx"
         :param env_id: Gymnasium id for the metadata; by default the environment's, or the dataset's
-        :param target_return: for the metadata, environment reward units; by default the environment's
+        :param target_return: for the metadata, environment reward units; by default the environment's, or the model's
         :raises ImportError: `sb3-dtfm[export]` is not installed
         :raises OSError: names the path, where what was there before still is
         :raises ValueError: the head does what no graph holds
@@ -436,6 +480,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
             target_return = self.env.get_attr("target_return", indices=0)[0] if target_return is None else target_return
         if env_id is None and self.buffer is not None:
             env_id = self.buffer.env_id
+        target_return = self.target_return if target_return is None else target_return
         exported = ExportedPolicy(self.policy)
         about = {"algorithm": type(self).__name__, "version": version("sb3-dtfm")}
         settings = {**about, "env_id": env_id, "target_return": target_return, **exported.settings}

@@ -4,6 +4,7 @@ from typing import ClassVar
 
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_dtfm.algorithms.base import POLICY_NAMES
 from sb3_dtfm.algorithms.offline import OfflineSequenceAlgorithm
 from sb3_dtfm.policies import DTPolicy
 
@@ -16,4 +17,4 @@ class DT(OfflineSequenceAlgorithm):
     Parameters are those of :class:`~sb3_dtfm.algorithms.base.OfflineAlgorithm`.
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": DTPolicy}
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = dict.fromkeys(POLICY_NAMES, DTPolicy)

@@ -4,6 +4,7 @@ from typing import ClassVar
 
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_dtfm.algorithms.base import POLICY_NAMES
 from sb3_dtfm.algorithms.offline import OfflineSequenceAlgorithm
 from sb3_dtfm.policies import DTFMPolicy
 
@@ -16,4 +17,4 @@ class DTFM(OfflineSequenceAlgorithm):
     :class:`~sb3_dtfm.heads.flow.FlowHead`.
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": DTFMPolicy}
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = dict.fromkeys(POLICY_NAMES, DTFMPolicy)

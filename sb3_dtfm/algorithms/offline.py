@@ -15,9 +15,10 @@ from stable_baselines3.common.utils import configure_logger, update_learning_rat
 
 from sb3_dtfm.algorithms.base import OfflineAlgorithm
 from sb3_dtfm.arguments import POSITIVE
-from sb3_dtfm.callbacks import GradientStepProgressBar, NormalizedScoreCallback, find_eval_callbacks
+from sb3_dtfm.callbacks import GradientStepProgressBar, NormalizedScoreCallback, TimeLeft, find_eval_callbacks
 from sb3_dtfm.data import TrajectoryBuffer
 from sb3_dtfm.distributed import DataParallel, LossFunction, is_first_process, n_processes
+from sb3_dtfm.envs import check_vec_env, share_target_return
 from sb3_dtfm.optimization import (
     BATCHES,
     DROPOUT,
@@ -52,12 +53,16 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
 
     progress_bar_class: type[ProgressBarCallback] = GradientStepProgressBar
 
-    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False, *own: BaseCallback) -> BaseCallback:
         if not is_first_process():
-            callback, progress_bar = None, False
+            callback, progress_bar, own = None, False, ()
         if isinstance(callback, list):
             callback = CallbackList(callback)
         evaluations = find_eval_callbacks(callback) if isinstance(callback, BaseCallback) else []
+        for evaluation in evaluations:
+            name, remedy = "The evaluation environment of EvalCallback", "EvalCallback(ReturnToGoWrapper(eval_env), ...)"
+            check_vec_env(evaluation.eval_env, name, remedy)
+            share_target_return(evaluation.eval_env, self.target_return)
         if self.env is None and evaluations:  # SB3's callbacks ask the model for an environment
             self.n_envs = evaluations[0].eval_env.num_envs
             self.set_env(evaluations[0].eval_env)
@@ -66,7 +71,7 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
             children.append(NormalizedScoreCallback(self.score_reference, evaluations))
         if progress_bar:
             children.append(self.progress_bar_class())
-        combined = CallbackList(children)
+        combined = CallbackList([*children, *own])
         combined.init_callback(self)
         return combined
 
@@ -93,7 +98,7 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         if not self._custom_logger:
             verbose, folder = (self.verbose, self.tensorboard_log) if is_first_process() else (0, None)
             self._logger = configure_logger(verbose, folder, tb_log_name, reset_num_timesteps)
-        return total_timesteps, self._init_callback(callback, progress_bar)
+        return total_timesteps, self._init_callback(callback, progress_bar, TimeLeft())
 
     def learn(
         self: SelfAlgorithm,
@@ -116,7 +121,8 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         :param reset_num_timesteps: count from zero, otherwise go on counting
         :param progress_bar: show one
         :return: the model
-        :raises ValueError: no dataset, or an argument out of range
+        :raises ValueError: no dataset, an argument out of range, or a callback that evaluates in an environment which is not
+            wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
         :raises FloatingPointError: the loss or its gradient is no longer finite, with the step, its episodes and the last
             checkpoint; such a step changes no weight
         :raises MemoryError: a gradient step needs more than there is, with what decides how much that is

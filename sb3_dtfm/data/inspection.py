@@ -36,7 +36,7 @@ class Inspection(NamedTuple):
     :param observations: of O dimensions
     :param actions: of A dimensions, in the environment's range; of a Discrete space's n actions, whose mean is a share
     :param at_bounds: share of all actions' entries at a bound of the action space, of no meaning for Discrete ones
-    :param target_return: to ask for: the mean return of the best tenth of the episodes, four digits
+    :param target_return: to ask for, see :func:`suggest_target_return`
     :param remarks: sentences about what may be wrong
     """
 
@@ -60,9 +60,17 @@ def inspect_buffer(buffer: TrajectoryBuffer) -> Inspection:
     low, high = (th.from_numpy(bound).to(values) for bound in bounds_of(vector_space(buffer.action_space)))
     margin = AT_BOUND * (high - low)
     at_bounds = float(((values <= low + margin) | (values >= high - margin)).float().mean())
-    best = buffer.best(best_share=BEST_SHARE).episode_returns.mean()
     remarks = [*_of_episodes(buffer), *_of_observations(observations), *_of_actions(buffer, actions, at_bounds)]
-    return Inspection(observations, actions, at_bounds, float(f"{best:.4g}"), remarks)
+    return Inspection(observations, actions, at_bounds, suggest_target_return(buffer), remarks)
+
+
+def suggest_target_return(buffer: TrajectoryBuffer) -> float:
+    """
+    The mean return of the best tenth of the episodes, four digits, environment reward units.
+
+    :param buffer: as it is learned from
+    """
+    return float(f"{buffer.best(best_share=BEST_SHARE).episode_returns.mean():.4g}")
 
 
 def _range(values: th.Tensor) -> Range:

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 from sb3_dtfm.algorithms import DTFM
 from sb3_dtfm.algorithms.offline import OfflineSequenceAlgorithm
 from sb3_dtfm.arguments import POSITIVE, check_arguments
-from sb3_dtfm.envs import BETWEEN, OBSERVATION, RETURN_TO_GO, TIMESTEP, check_vec_env
+from sb3_dtfm.envs import BETWEEN, OBSERVATION, RETURN_TO_GO, TIMESTEP, check_vec_env, share_target_return
 from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.policies.normalization import OBSERVATION_CLIP
 from sb3_dtfm.windows import Context
@@ -49,6 +49,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
         action_space = self._action_space(model.policy, float(bound))
         check_vec_env(venv)
         model._check_spaces(venv.observation_space, venv.action_space, "The environment has", "the model's are")  # type: ignore[arg-type]
+        share_target_return(venv, model.target_return)
         n_shown = self._n_shown(model.policy) + (model.policy.network.trunk.embed_dim if hidden_state else 0)
         super().__init__(venv, spaces.Box(-OBSERVATION_CLIP, OBSERVATION_CLIP, (n_shown,), np.float32), action_space)
         self.model = model

@@ -120,7 +120,7 @@ class ActingPolicy(BasePolicy):
         if remembers:
             self._remembered.remember(before, context)
         action = self._to_environment(context.actions[:, -1])
-        return action if vectorized else action.squeeze(axis=0), tuple(context)
+        return action if vectorized else action.squeeze(axis=0), context
 
     def _known(self, state: tuple[np.ndarray, ...] | None, n_rows: int) -> Context:
         """The context to go on from; a plan for another number of steps than are planned now is dropped."""

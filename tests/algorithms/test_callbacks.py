@@ -1,5 +1,7 @@
 """What is evaluated, when, and what the log says of it."""
 
+import re
+
 import numpy as np
 import pytest
 import torch as th
@@ -7,7 +9,7 @@ from stable_baselines3.common.callbacks import EvalCallback, EveryNTimesteps, St
 from stable_baselines3.common.monitor import Monitor
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_dtfm import DT, DTFM
+from sb3_dtfm import DT, DTFM, callbacks
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, FlowFigure
 from sb3_dtfm.data import ScoreReference
 from tests.algorithms.small import make_model, record_curves
@@ -117,3 +119,41 @@ def test_learning_begins_by_saying_how_often_it_will_see_the_data(capsys):
     assert "6 gradient steps of 4 windows: 2.0 epochs of 12 recorded steps" in capsys.readouterr().out
     model.learn(3, log_interval=None, reset_num_timesteps=False)
     assert "3 gradient steps of 4 windows: 1.0 epochs of 12 recorded steps" in capsys.readouterr().out
+
+
+@pytest.fixture
+def at_once(monkeypatch):
+    """The time that is left is told as soon as so many gradient steps are timed."""
+    monkeypatch.setattr(callbacks, "SECONDS_TIMED", 0.0)
+
+
+def test_learning_says_once_how_long_the_rest_takes(at_once, capsys):
+    make_model(DTFM, make_buffer([5, 7]), batch_size=4, verbose=1).learn(30, log_interval=1)
+    left = r"About \S+ (s|min) left on this CPU \([\d.,]+ gradient steps a second\)\."
+    assert len(re.findall(left, capsys.readouterr().out)) == 1
+
+
+@pytest.mark.parametrize(("n_steps", "verbose"), [(3, 1), (30, 0)])
+def test_a_short_or_silent_training_says_nothing_of_it(n_steps, verbose, at_once, capsys):
+    make_model(DT, make_buffer([5, 7]), batch_size=4, verbose=verbose).learn(n_steps, log_interval=None)
+    assert "left" not in capsys.readouterr().out
+
+
+def test_more_than_half_an_hour_is_a_warning_with_what_to_change(at_once):
+    model = make_model(DT, make_buffer([5, 7]), batch_size=4)
+    with pytest.warns(UserWarning, match=r"About [\d.,]+ h left on this CPU .* lower total_timesteps.*embed_dim") as caught:
+        model.learn(10**8, callback=lambda *_: model.num_timesteps < 20, log_interval=None)
+    assert [warning.filename for warning in caught] == [__file__]
+
+
+def test_the_time_left_changes_nothing_that_is_learned(at_once):
+    silent, spoken = (make_model(DT, make_buffer([5, 7]), batch_size=4, verbose=verbose).learn(20) for verbose in (0, 1))
+    for name, tensor in silent.policy.state_dict().items():
+        assert th.equal(tensor, spoken.policy.state_dict()[name]), name
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"), [(8.2, "8.2 s"), (89, "89 s"), (90, "1.5 min"), (3000, "50 min"), (22_000, "6.1 h"), (1e6, "280 h")]
+)
+def test_a_duration_has_two_digits(seconds, said):
+    assert callbacks._duration(seconds) == said

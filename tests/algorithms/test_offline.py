@@ -321,11 +321,6 @@ def test_a_loss_that_is_no_longer_finite_stops_training_with_advice(cheetah_buff
         model.learn(3)
 
 
-def test_an_env_without_return_to_go_is_refused(cheetah_buffer):
-    with pytest.raises(ValueError, match="ReturnToGoWrapper"):
-        make_model(DT, cheetah_buffer, env=gym.make("HalfCheetah-v5"))
-
-
 def test_observation_normalisation_and_frame_stacking_are_refused(cheetah_buffer):
     with pytest.raises(ValueError, match=r"VecNormalize\(norm_obs=True\)"):
         make_model(DT, cheetah_buffer, env=VecNormalize(DummyVecEnv([make_env])))

@@ -34,7 +34,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.envs import ReturnToGoWrapper
-from tests.algorithms.small import make_model, record_curves
+from tests.algorithms.small import TINY, make_model, record_curves
 from tests.conftest import EPISODE_LENGTH, make_env
 
 
@@ -118,6 +118,21 @@ def test_callbacks_in_a_list_or_as_a_function(cheetah_buffer, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["rl_model_2_steps.zip"], "there is no replay buffer to save"
     make_model(DT, cheetah_buffer).learn(3, callback=lambda local, _: steps.append(local["self"].num_timesteps) is None)
     assert steps == [1, 2, 3]
+
+
+@pytest.mark.parametrize("algorithm", [DT, DTFM])
+def test_mlp_policy_is_another_name_of_the_policy(algorithm, cheetah_buffer, tmp_path):
+    settings = dict(dataset=cheetah_buffer, seed=0, device="cpu", policy_kwargs=TINY[algorithm])
+    models = [algorithm(name, make_env(), **settings) for name in ("MlpPolicy", "MultiInputPolicy")]
+    assert type(models[0].policy) is type(models[1].policy)
+    models[0].save(tmp_path / "model")
+    assert type(algorithm.load(tmp_path / "model").policy) is type(models[1].policy)
+
+
+def test_a_policy_of_another_name_is_refused_with_the_names_there_are(cheetah_buffer):
+    message = r"policy must be 'MultiInputPolicy' \(or 'MlpPolicy'\), got 'CnnPolicy'"
+    with pytest.raises(ValueError, match=message):
+        DT("CnnPolicy", make_env(), cheetah_buffer)
 
 
 def test_a_progress_bar_counts_gradient_steps(cheetah_buffer, capsys):

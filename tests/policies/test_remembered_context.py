@@ -156,6 +156,14 @@ def test_two_environments_that_take_turns_with_their_own_states_act_as_alone(mod
     assert hints() == []
 
 
+def test_what_predict_returns_is_short_and_an_ordinary_tuple_to_others(model, episodes):
+    _, state = model.predict(episodes[0][0])
+    assert repr(state) == "Context(1 row, 5 steps)"
+    assert isinstance(state, tuple)
+    again, restored = (act(model, episodes[0][1], state=each) for each in (state, tuple(state)))
+    assert np.array_equal(again, restored)
+
+
 @pytest.mark.filterwarnings("ignore:.*state:UserWarning")
 def test_reset_forgets(model, episodes):
     observations = episodes[0]
