@@ -18,9 +18,15 @@ from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.distributed import first_of_each_machine_first
 from sb3_dtfm.networks import trunk
 from sb3_dtfm.networks.cpu import dropout
-from tests.conftest import TINY_FLOW_POLICY, TINY_POLICY
+from tests.conftest import PLAIN, TINY_FLOW_POLICY, TINY_POLICY
 
-CHUNKS = {"chunk_size": 3, "tokens_per_step": 1, "film_return_to_go": True, "regression_coef": 0.5}
+CHUNKS = {
+    "chunk_size": 3,
+    "tokens_per_step": 1,
+    "film_return_to_go": True,
+    "clip_return_to_go": True,
+    "regression_coef": 0.5,
+}
 ALGORITHMS = {
     "DT": (DT, TINY_POLICY),
     "DTFM": (DTFM, {**TINY_FLOW_POLICY, "regression_coef": 0.5}),
@@ -42,8 +48,8 @@ def make_buffer() -> TrajectoryBuffer:
 
 def make_model(name: str, **kwargs):
     algorithm, settings = ALGORITHMS[name]
-    settings = {"dropout": 0.0, **settings, **kwargs.pop("policy_kwargs", {})}
-    arguments = dict(batch_size=64, context_length=8, seed=0, learning_rate=1e-3, ema_decay=0.9, precision="float32")
+    settings = {**settings, "dropout": 0.0, **kwargs.pop("policy_kwargs", {})}
+    arguments = {**PLAIN, **dict(batch_size=64, context_length=8, seed=0, learning_rate=1e-3, ema_decay=0.9)}
     arguments |= dict(max_grad_norm=0.5, device="cpu", policy_kwargs=settings)
     return algorithm("MultiInputPolicy", dataset=make_buffer(), **{**arguments, **kwargs})
 

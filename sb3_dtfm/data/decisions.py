@@ -15,6 +15,8 @@ FLOW_STEPS = 10
 # Of the regression that looks for plans: share of the episodes it is judged by, steps at most, random features, penalties.
 HELD_OUT, MAX_STEPS, N_FEATURES, PENALTIES = 0.2, 8192, 512, (1e-3, 1e-1, 10.0)
 CLIP, SMALLEST_STD = 10.0, 1e-6
+# Standard deviation of the episodes' returns, as a share of the largest one, below which they are all alike.
+SMALLEST_SPREAD = 0.05
 
 
 class Decision(NamedTuple):
@@ -35,8 +37,23 @@ def decide(buffer: TrajectoryBuffer) -> list[Decision]:
 
     :param buffer: what is learned from
     """
-    if not isinstance(buffer.action_space, spaces.Box):
-        return []
+    decisions = [_return_conditioning(buffer)]
+    if isinstance(buffer.action_space, spaces.Box):
+        decisions += _kind_of_actor(buffer)
+    return decisions
+
+
+def _return_conditioning(buffer: TrajectoryBuffer) -> Decision:
+    """Where returns hardly differ, a return-to-go tells the moment of an episode and not its quality."""
+    spread = float(buffer.episode_returns.std() / max(np.abs(buffer.episode_returns).max(), SMALLEST_STD))
+    differ = spread >= SMALLEST_SPREAD
+    verb = "differ" if differ else "hardly differ"
+    reason = f"Returns of episodes {verb} (standard deviation {spread:.1%} of the largest)."
+    return Decision("return_conditioning", differ, reason)
+
+
+def _kind_of_actor(buffer: TrajectoryBuffer) -> list[Decision]:
+    """See :func:`plan_ratio`."""
     ratio = plan_ratio(buffer)
     plans = ratio > 1.0
     # The trunk learns by the loss of what acts: the flow's, or the regression's.
@@ -44,8 +61,8 @@ def decide(buffer: TrajectoryBuffer) -> list[Decision]:
     settings = {"chunk_size": CHUNK_SIZE if plans else 1, **flow, "calm_units": not plans}
     better, worse = ("the previous action", "the observation") if plans else ("the observation", "the previous action")
     times = max(ratio, 1.0 / max(ratio, 1e-3))
-    reason = f"{better} predicts a recorded action better than {worse} (squared error {times:.1f} times smaller)."
-    return [Decision(name, value, reason.capitalize()) for name, value in settings.items()]
+    reason = f"{better.capitalize()} predicts an action better than {worse} (squared error {times:.1f} times smaller)."
+    return [Decision(name, value, reason) for name, value in settings.items()]
 
 
 def plan_ratio(buffer: TrajectoryBuffer) -> float:

@@ -21,6 +21,7 @@ from sb3_dtfm.benchmark.rows import read_rows, write_row
 from sb3_dtfm.benchmark.settings import Task, task_settings
 from sb3_dtfm.cli.benchmark import parse_arguments
 from sb3_dtfm.cli.main import main
+from sb3_dtfm.heads import HEADS
 from sb3_dtfm.zoo.arguments import UsageError
 from tests.recorded import DATASET_ID
 
@@ -211,13 +212,11 @@ def test_a_cell_that_another_process_runs_is_left_to_it(grid, stub, workplace, c
     assert [path.name for path in (workplace / "results").glob("*.jsonl")] == [f"{TASK}_1_dtfm_seed0_tiny.jsonl"]
 
 
-@pytest.mark.parametrize("profile", ["small", "paper"])
+@pytest.mark.parametrize("profile", ["default", "paper"])
 @pytest.mark.parametrize("env_id", [TASK, "Ant-v5", "robosuite/Lift-v0"])
 def test_the_packaged_profiles_differ_in_the_head_only(profile, env_id):
     dt, dtfm = (task_settings(profile, algo, Task(env_id), 0.5, None, {}) for algo in ("dt", "dtfm"))
-    own = {"flow_hidden_dim", "flow_n_layers", "solver", "n_solver_steps"}
-    if profile == "small":
-        own |= {"flow_prediction", "flow_tau_exponent", "one_step"}
+    own = set(HEADS["DTFM"].options()) if profile == "paper" else set()
     assert set(dtfm["policy_kwargs"]) - set(dt["policy_kwargs"]) == own
     dtfm["policy_kwargs"] = {key: value for key, value in dtfm["policy_kwargs"].items() if key not in own}
     assert dt == dtfm
@@ -229,9 +228,9 @@ def test_policy_kwargs_of_params_are_merged_and_heads_left_to_their_algorithm(ne
     """Also where they stand beside the others, by their own names."""
     kwargs = {"n_solver_steps": 3, "dropout": 0.0, "regression_coef": 0.1}
     changes = {**({"policy_kwargs": kwargs} if nested else kwargs), "ema_decay": 0.9}
-    dt, dtfm = (task_settings("small", algo, Task(TASK), 1.0, 7, changes) for algo in ("dt", "dtfm"))
+    dt, dtfm = (task_settings("paper", algo, Task(TASK), 1.0, 7, changes) for algo in ("dt", "dtfm"))
     assert (dtfm["policy_kwargs"]["n_solver_steps"], dtfm["policy_kwargs"]["regression_coef"]) == (3, 0.1)
-    assert dtfm["policy_kwargs"]["embed_dim"] == 128
+    assert dtfm["policy_kwargs"]["embed_dim"] == 256
     assert (dt["policy_kwargs"]["dropout"], dt["ema_decay"], dt["n_timesteps"]) == (0.0, 0.9, 7)
     assert not {"n_solver_steps", "regression_coef"} & set(dt["policy_kwargs"])
 

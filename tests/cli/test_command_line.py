@@ -23,9 +23,7 @@ def train(algo: str, *arguments: str) -> int:
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_train_writes_what_enjoy_reads(algo, workplace, capsys):
-    assert (
-        train(algo, "--conf-file", "small", "--eval-freq", "2", "--eval-episodes", "1", "--save-freq", "3", "-tb", "tb") == 0
-    )
+    assert train(algo, "--eval-freq", "2", "--eval-episodes", "1", "--save-freq", "3", "-tb", "tb") == 0
     run = workplace / "logs" / algo / "HalfCheetah-v5_1"
     names = {"HalfCheetah-v5.zip", "best_model.zip", "evaluations.npz", "rl_model_3_steps.zip"}
     assert names <= {path.name for path in run.iterdir()}
@@ -43,9 +41,9 @@ def test_train_writes_what_enjoy_reads(algo, workplace, capsys):
 
 
 def test_a_trained_agent_goes_on_training(workplace, capsys):
-    assert train("dtfm", "--eval-freq", "-1", "--conf-file", "small") == 0
+    assert train("dtfm", "--eval-freq", "-1") == 0
     first = workplace / "logs" / "dtfm" / "HalfCheetah-v5_1" / "HalfCheetah-v5.zip"
-    assert train("dtfm", "--eval-freq", "-1", "--conf-file", "small", "--trained-agent", str(first)) == 0
+    assert train("dtfm", "--eval-freq", "-1", "--trained-agent", str(first)) == 0
     assert "Loading pretrained agent" in capsys.readouterr().out
     second = workplace / "logs" / "dtfm" / "HalfCheetah-v5_2" / "HalfCheetah-v5.zip"
     before, after = DTFM.load(first), DTFM.load(second)
@@ -58,7 +56,7 @@ def test_a_trained_agent_goes_on_training_with_evaluations_on_a_scale_of_scores(
     shutil.copytree(minari_folder, workplace / "scored")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(workplace / "scored"))
     minari.load_dataset(DATASET_ID).storage.update_metadata({"ref_min_score": -100.0, "ref_max_score": 100.0})
-    settings = ["--conf-file", "small", "--eval-freq", "2", "--eval-episodes", "1", "-tb", "tb"]
+    settings = ["--eval-freq", "2", "--eval-episodes", "1", "-tb", "tb"]
     assert train("dt", *settings) == 0
     runs = workplace / "logs" / "dt"
     assert train("dt", *settings, "--trained-agent", str(runs / "HalfCheetah-v5_1" / "HalfCheetah-v5.zip")) == 0
@@ -72,7 +70,7 @@ def test_a_trained_agent_goes_on_training_with_evaluations_on_a_scale_of_scores(
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_a_callback_of_the_users_own_runs_beside_the_evaluation(algo, workplace):
     callback = "callback:{'stable_baselines3.common.callbacks.CheckpointCallback':dict(save_freq=3,save_path='mine')}"
-    assert train(algo, "-params", callback, "--conf-file", "small", "--eval-freq", "3", "--eval-episodes", "1") == 0
+    assert train(algo, "-params", callback, "--eval-freq", "3", "--eval-episodes", "1") == 0
     assert [path.name for path in (workplace / "mine").iterdir()] == ["rl_model_3_steps.zip"]
     run = workplace / "logs" / algo / "HalfCheetah-v5_1"
     assert np.load(run / "evaluations.npz")["timesteps"].tolist() == [0, 3, 4]
@@ -176,7 +174,7 @@ def test_debug_shows_the_traceback(workplace):
 def test_an_error_in_the_midst_of_training_keeps_its_traceback_and_its_run(workplace):
     callback = "callback:{'stable_baselines3.common.callbacks.CheckpointCallback':dict(save_freq=3,save_path='/proc/none')}"
     with pytest.raises(TrainingError, match="after 0 timesteps: FileNotFoundError") as error:
-        train("dtfm", "-params", callback, "--conf-file", "small", "--eval-freq", "-1")
+        train("dtfm", "-params", callback, "--eval-freq", "-1")
     assert isinstance(error.value.__cause__, FileNotFoundError)
     assert (workplace / "logs" / "dtfm" / "HalfCheetah-v5_1" / "HalfCheetah-v5" / "config.yml").is_file()
 
@@ -210,7 +208,7 @@ def test_help_names_the_additions_and_rl_zoos_options(capsys):
         main(["train", "--help"])
     assert exit_.value.code == 0
     text = capsys.readouterr().out
-    for option in ("--dataset-fraction", "--target-return", "--optimize-hyperparameters", "'small'"):
+    for option in ("--dataset-fraction", "--target-return", "--optimize-hyperparameters", "'paper'"):
         assert option in text
 
 

@@ -36,7 +36,7 @@ def wait_for(look: Callable[[], bool]) -> bool:
 @pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="needs chromium")
 def test_the_page_shows_the_curves_of_a_training(workplace):
-    arguments = ["--dataset", DATASET_ID, "--conf-file", "small", "--eval-freq", "2", "--eval-episodes", "1", "-tb", "tb"]
+    arguments = ["--dataset", DATASET_ID, "--eval-freq", "2", "--eval-episodes", "1", "-tb", "tb"]
     assert main([*tiny_training("dtfm", *arguments), "--log-interval", "1"]) == 0
     server = program.TensorBoard()
     server.configure(argv=["tensorboard", "--logdir", "tb", "--port", "0"])

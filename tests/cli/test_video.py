@@ -32,7 +32,7 @@ def trained(workplace, monkeypatch) -> Path:
     """The folder of a run with a checkpoint, and a later one that has no model, as -optimize leaves it."""
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.delenv("DISPLAY", raising=False)
-    settings = ["--dataset", DATASET_ID, "--conf-file", "small", "--eval-freq", "-1", "--save-freq", "3"]
+    settings = ["--dataset", DATASET_ID, "--eval-freq", "-1", "--save-freq", "3"]
     assert main(tiny_training("dtfm", *settings)) == 0
     (workplace / "logs" / "dtfm" / "HalfCheetah-v5_10").mkdir()
     return Path("logs", "dtfm", "HalfCheetah-v5_1")

@@ -22,7 +22,7 @@ def logs(minari_folder, tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(place)
         patch.setenv("MINARI_DATASETS_PATH", str(minari_folder))
-        ours = tiny_training("dtfm", "--dataset", DATASET_ID, "--conf-file", "small", "--eval-freq", "2", *EVALUATED)
+        ours = tiny_training("dtfm", "--dataset", DATASET_ID, "--eval-freq", "2", *EVALUATED)
         assert main(ours) == 0
         sac = ["train", "--algo", "sac", "--env", "HalfCheetah-v5", "-n", "60", "--eval-freq", "30", *EVALUATED]
         assert main([*sac, "-params", "learning_starts:100"]) == 0

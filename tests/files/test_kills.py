@@ -73,7 +73,7 @@ def kill_often(work: Callable[[], object], check: Callable[[], object], seed: in
 def test_a_killed_training_leaves_models_that_load(workplace, monkeypatch):
     """A checkpoint, a best model, a numbered one and the last one, all the time over those of the runs before."""
     monkeypatch.setattr(resuming, "CHECKPOINT_INTERVAL", 0.0)
-    settings = ["--dataset", DATASET_ID, "--conf-file", "small", "--eval-freq", "3", "--eval-episodes", "1", "--seed", "0"]
+    settings = ["--dataset", DATASET_ID, "--eval-freq", "3", "--eval-episodes", "1", "--seed", "0"]
 
     def train() -> None:
         resume = ["--resume", str(RUN)] if (RUN / resuming.START).is_file() else []

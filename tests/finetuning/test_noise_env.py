@@ -123,7 +123,8 @@ def test_what_is_shown_is_in_the_units_of_the_data(model):
     normalization = model.policy.normalization
     expected = (raw["observation"] - normalization.observation_mean.numpy()) / normalization.observation_std.numpy()
     np.testing.assert_allclose(shown[:, :17], expected.clip(-10, 10), atol=1e-4)
-    np.testing.assert_allclose(shown[:, 17], raw["return_to_go"][:, 0] / normalization.return_scale.numpy(), atol=1e-5)
+    deviations = (raw["return_to_go"][:, 0] - normalization.return_mean[0].item()) / normalization.return_std[0].item()
+    np.testing.assert_allclose(shown[:, 17], deviations.clip(-5, 5) / 4, atol=1e-5)
     np.testing.assert_allclose(shown[:, 18], 0.0)
     assert shown.shape == (3, 17 + 2 + 32)
     assert env.observation_space.contains(shown[0])

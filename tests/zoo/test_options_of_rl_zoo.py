@@ -10,7 +10,7 @@ from sb3_dtfm.cli.main import main
 from tests.recorded import DATASET_ID, tiny_training
 
 RUN = Path("logs/dt/HalfCheetah-v5_1")
-SETTINGS = ["--dataset", DATASET_ID, "--conf-file", "small", "--verbose", "0"]
+SETTINGS = ["--dataset", DATASET_ID, "--verbose", "0"]
 
 
 def test_what_changes_nothing_in_a_run_without_episodes_is_accepted(workplace):

@@ -21,7 +21,7 @@ from tests.recorded import DATASET_ID, tiny_training
 
 RUN = Path("logs/dtfm/HalfCheetah-v5_1")
 N_STEPS, SIGNAL_AT, KILL_AT = 40, 17, 26
-SETTINGS = ["--dataset", DATASET_ID, "-n", str(N_STEPS), "--conf-file", "small", "-tb", "tb", "--log-interval", "5"]
+SETTINGS = ["--dataset", DATASET_ID, "-n", str(N_STEPS), "-tb", "tb", "--log-interval", "5"]
 SETTINGS += ["--eval-freq", "10", "--eval-episodes", "2", "--vec-env", "dummy"]
 
 

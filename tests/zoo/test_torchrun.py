@@ -51,7 +51,7 @@ def wait_for(path: Path) -> None:
 
 
 def test_process_0_does_what_rl_zoo_does_and_the_other_leaves_no_trace(workplace):
-    settings = ["--conf-file", "small", "--eval-freq", "2", "--eval-episodes", "1", "--save-freq", "3", "-P", "-tb", "tb"]
+    settings = ["--eval-freq", "2", "--eval-episodes", "1", "--save-freq", "3", "-P", "-tb", "tb"]
     process = start(*TORCHRUN, *tiny_training("dtfm", "--dataset", DATASET_ID, *settings))
     output, errors = process.communicate(timeout=LIMIT)
     assert process.returncode == 0, errors
@@ -81,7 +81,7 @@ def test_what_several_processes_cannot_do_is_refused(arguments, message, workpla
 
 @pytest.mark.slow
 def test_an_interrupt_saves_the_model_and_ends_all(workplace):
-    settings = ["--conf-file", "small", "--eval-freq", "-1", "--save-freq", "20", "-n", "1000000000"]
+    settings = ["--eval-freq", "-1", "--save-freq", "20", "-n", "1000000000"]
     process = start(*TORCHRUN, *tiny_training("dt", "--dataset", DATASET_ID, *settings), start_new_session=True)
     run = workplace / "logs" / "dt" / "HalfCheetah-v5_1"
     wait_for(run / "rl_model_20_steps.zip")
@@ -94,7 +94,7 @@ def test_an_interrupt_saves_the_model_and_ends_all(workplace):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_a_training_of_two_processes_goes_on_to_the_bit(number, workplace):
-    settings = ["--conf-file", "small", "--eval-freq", "-1", "--seed", "3", "-n", "60", "--dataset", DATASET_ID]
+    settings = ["--eval-freq", "-1", "--seed", "3", "-n", "60", "--dataset", DATASET_ID]
     straight = start(*TORCHRUN, *tiny_training("dtfm", *settings, "-f", "straight"))
     assert straight.wait(LIMIT) == 0
     signals = [{"tests.zoo.test_torchrun.CheckpointThenSignal": {"number": int(number)}}]
@@ -119,7 +119,7 @@ def test_two_workers_search_together(workplace):
     """Each does one trial, at the same time, and both find two in the study."""
     search = ["-n", "1", "-optimize", "--n-trials", "1", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots"]
     shared = ["--study-name", "shared", "--storage", "studies/search.log", "--uuid"]
-    command = tiny_training("dt", "--dataset", DATASET_ID, "--conf-file", "small", *search, *shared)
+    command = tiny_training("dt", "--dataset", DATASET_ID, *search, *shared)
     workers = [start(sys.executable, "-m", "sb3_dtfm", *command) for _ in range(2)]
     for worker in workers:
         _, errors = worker.communicate(timeout=2 * LIMIT)

@@ -15,7 +15,7 @@ from sb3_dtfm import __version__
 from tests.recorded import DATASET_ID, tiny_training
 
 ROOT = Path(__file__).parents[2]
-CONFIGS = {f"sb3_dtfm/zoo_configs/{name}" for name in ("dtfm.yml", "dt.yml", "small/dtfm.yml", "small/dt.yml")}
+CONFIGS = {f"sb3_dtfm/zoo_configs/{name}" for name in ("dtfm.yml", "dt.yml", "paper/dtfm.yml", "paper/dt.yml")}
 
 
 def run(*command: str, **kwargs) -> str:
@@ -71,7 +71,7 @@ def test_train_and_enjoy_from_the_wheel_outside_of_the_sources(wheel, workplace)
     assert all(path.startswith(str(site)) for path in found), found
 
     command = [sys.executable, str(site / "bin" / "sb3-dtfm")]
-    training = tiny_training("dtfm", "--dataset", DATASET_ID, "--conf-file", "small", "--eval-freq", "-1")
+    training = tiny_training("dtfm", "--dataset", DATASET_ID, "--eval-freq", "-1")
     assert "Saving to logs/dtfm" in run(*command, *training, cwd=workplace, env=environment)
     enjoy = ["enjoy", "--algo", "dtfm", "--env", "HalfCheetah-v5", "--no-render", "-n", "40"]
     assert "2 Episodes" in run(sys.executable, "-m", "sb3_dtfm", *enjoy, cwd=workplace, env=environment)
