@@ -15,7 +15,7 @@ from stable_baselines3.common.utils import LinearSchedule, get_device
 
 from sb3_dtfm.algorithms.saving import ENCODED, OPTIMIZER, POLICY, SPACES, UnsavedSchedule, head_name, optimizers
 from sb3_dtfm.arguments import COUNT, NOT_NEGATIVE, Number, Rule, check_arguments
-from sb3_dtfm.data import check_action_space
+from sb3_dtfm.data import ReturnReference, check_action_space
 from sb3_dtfm.envs import OBSERVATION, RETURN_TO_GO, TIMESTEP
 from sb3_dtfm.files import ModelFileError, file_name, read_model
 from sb3_dtfm.optimization import RunningMeans
@@ -38,6 +38,13 @@ COUNTERS: dict[str, Rule] = {
     "time_limit": COUNT._replace(optional=True),
     "_n_left": WHOLE,
     "verbose": WHOLE,
+}
+RETURN_REFERENCE: dict[str, Rule] = {
+    "recorded": Number(),
+    "best_tenth": Number(),
+    "n_episodes": COUNT,
+    "success_rate": Number(low=0, high=1, optional=True),
+    "random": Number(optional=True),
 }
 # Of the policy's tensors.
 POSITIVE_BUFFERS = {
@@ -196,6 +203,8 @@ def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
         raise ModelFileError(f"{source}: score_reference is {reference}, expected two returns and where they come from.")
     with naming_the_file(source):
         check_arguments({**dict.fromkeys(COUNTERS, 1), **attributes}, COUNTERS)  # one may have been left out
+        if (returns := attributes.get("return_reference")) is not None:
+            check_arguments(ReturnReference(*returns)._asdict(), RETURN_REFERENCE)
     observation, action = attributes["observation_space"], attributes["action_space"]
     parts = observation.spaces if isinstance(observation, spaces.Dict) else {}
     is_vector = {name: isinstance(part, spaces.Box) and len(part.shape) == 1 for name, part in parts.items()}
