@@ -39,13 +39,8 @@ COUNTERS: dict[str, Rule] = {
     "_n_left": WHOLE,
     "verbose": WHOLE,
 }
-RETURN_REFERENCE: dict[str, Rule] = {
-    "recorded": Number(),
-    "best_tenth": Number(),
-    "n_episodes": COUNT,
-    "success_rate": Number(low=0, high=1, optional=True),
-    "random": Number(optional=True),
-}
+# Of a ReturnReference, in its order.
+RETURN_REFERENCE = (Number(), Number(), COUNT, Number(low=0, high=1, optional=True), Number(optional=True))
 # Of the policy's tensors.
 POSITIVE_BUFFERS = {
     "normalization.observation_std",
@@ -201,10 +196,12 @@ def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
     kinds = [type(each) for each in reference] if isinstance(reference, list) else reference
     if kinds not in (None, [float, float, str]) or (reference and not reference[0] < reference[1]):
         raise ModelFileError(f"{source}: score_reference is {reference}, expected two returns and where they come from.")
+    returns = attributes.get("return_reference")
+    known = isinstance(returns, list) and len(returns) == len(RETURN_REFERENCE)
+    if returns is not None and not (known and all(map(Number.accepts, RETURN_REFERENCE, returns))):
+        raise ModelFileError(f"{source}: return_reference is {returns}, expected {', '.join(ReturnReference._fields)}.")
     with naming_the_file(source):
         check_arguments({**dict.fromkeys(COUNTERS, 1), **attributes}, COUNTERS)  # one may have been left out
-        if (returns := attributes.get("return_reference")) is not None:
-            check_arguments(ReturnReference(*returns)._asdict(), RETURN_REFERENCE)
     observation, action = attributes["observation_space"], attributes["action_space"]
     parts = observation.spaces if isinstance(observation, spaces.Dict) else {}
     is_vector = {name: isinstance(part, spaces.Box) and len(part.shape) == 1 for name, part in parts.items()}
