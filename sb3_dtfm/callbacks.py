@@ -97,6 +97,9 @@ class SeedEvaluations(BaseCallback):
         self.eval_callbacks = [evaluation for evaluation in eval_callbacks if evaluation.eval_freq > 0]
         self.seed = seed
 
+    def _on_training_start(self) -> None:
+        self._seed(self.eval_callbacks)
+
     def _on_step(self) -> bool:
         self._seed([each for each in self.eval_callbacks if (each.n_calls + 1) % each.eval_freq == 0])
         return True

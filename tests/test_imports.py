@@ -51,7 +51,19 @@ ROOMS = {
     ),
     "zoo": (
         "sb3_dtfm/zoo",
-        {"", "algorithms", "arguments", "policies", "callbacks", "envs", "distributed", "files", "finetuning", "zoo"},
+        {
+            "",
+            "algorithms",
+            "arguments",
+            "policies",
+            "callbacks",
+            "data",
+            "envs",
+            "distributed",
+            "files",
+            "finetuning",
+            "zoo",
+        },
     ),
     "benchmark": ("sb3_dtfm/benchmark", {"", "algorithms", "data", "envs", "optimization", "zoo", "benchmark", "files"}),
     "cli": (

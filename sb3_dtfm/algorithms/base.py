@@ -32,9 +32,17 @@ from sb3_dtfm.arguments import (
     Rule,
     check_arguments,
 )
-from sb3_dtfm.data import Dataset, DatasetError, ScoreReference, TrajectoryBuffer, check_action_space, load_dataset
+from sb3_dtfm.data import (
+    Dataset,
+    DatasetError,
+    ReturnReference,
+    ScoreReference,
+    TrajectoryBuffer,
+    check_action_space,
+    load_dataset,
+)
 from sb3_dtfm.data.decisions import Decision, decide
-from sb3_dtfm.data.inspection import suggest_target_return
+from sb3_dtfm.data.inspection import return_reference, suggested_target_return
 from sb3_dtfm.distributed import check_batch_size, first_of_each_machine_first, is_first_process
 from sb3_dtfm.envs import ReturnToGoWrapper, check_vec_env, known_task, return_to_go_space, share_target_return
 from sb3_dtfm.files import ModelFile, file_name, holds_pickles, read_model, write_model, write_onnx
@@ -183,6 +191,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         self.time_limit: int | None = None  # of the newest environment that it learned for
         self.score_reference: ScoreReference | None = None
         self.decisions: list[Decision] = []
+        self.return_reference: ReturnReference | None = None
         self.buffer: TrajectoryBuffer | None = None
         self._means = RunningMeans()
         self._training_seconds, self._timed_steps = 0.0, 0
@@ -261,11 +270,12 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
             self._check_task(buffer, self.env)
         buffer = buffer.random_fraction(self.dataset_fraction, self.dataset_seed)
         if self.target_return is None:
-            self._take_target_return(suggest_target_return(buffer))
+            self._take_target_return(suggested_target_return(buffer))
         if self.return_steps is not None:
             if self.verbose >= 1 and is_first_process():
                 print(f"Learning which returns may be expected (return_steps={self.return_steps})", flush=True)
             buffer = buffer.to("cpu").with_expected_returns(self.return_steps, self.dataset_seed)
+        self.return_reference = return_reference(buffer)
         self.buffer = buffer.to(self.device)
         return self.buffer
 
@@ -307,6 +317,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         self._check_arguments(learning_rate=NOT_NEGATIVE)
         if self.score_reference is not None:  # a list in a saved file
             self.score_reference = ScoreReference(*self.score_reference)
+        if self.return_reference is not None:
+            self.return_reference = ReturnReference(*self.return_reference)
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         self.policy = self._make_policy(ema=self.ema_decay > 0).to(self.device)

@@ -28,6 +28,8 @@ COLORS = ("#1b6ca8", "#c0562b", "#3f8f5f", "#7b5ea7")
 FIRST_STATE = 4_000_000
 # Between the initial states of two seeds.
 SEED_STRIDE = 10_000
+# Means differ if chance makes them as different this seldom. With fewer episodes for each return chance is not told apart.
+SIGNIFICANT, N_SHUFFLES, FEWEST_EPISODES = 0.05, 1_999, 6
 
 
 class Asked(NamedTuple):
@@ -74,6 +76,8 @@ def main(argv: Sequence[str]) -> None:
         names = [f"{i}: {name}" for i, name in enumerate(distinguished(options.models), 1)]
     curves = dict(zip(names, reached, strict=True))
     print("\n".join(table(curves)))
+    if len(targets) > 1:
+        print("\n".join(f"- {name}: {finding(asked)}" for name, asked in curves.items()))
     picture = draw(curves, returns, Path(options.output), options.env)
     numbers = picture.with_suffix(".json")
     origin = {"task": options.env, "dataset": options.dataset, "acting": acting, "first_state": first_state(options)}
@@ -216,6 +220,40 @@ def _summary(asked: Asked) -> str:
     limits = "" if np.isnan(low) else f" [{low:,.6g}, {high:,.6g}]"
     solved = "" if asked.successes is None else f", {sum(asked.successes)} of {len(asked.successes)} solved"
     return f"{estimate:,.6g}{limits}{solved}"
+
+
+def finding(reached: Sequence[Asked]) -> str:
+    """
+    Whether it matters what a model is asked for, and what to ask for.
+
+    :param reached: for each of two or more returns, as many episodes
+    :return: a sentence
+    """
+    returns = np.array([asked.returns for asked in reached])
+    n_episodes, means = returns.shape[1], returns.mean(axis=1)
+    if chance(returns) < SIGNIFICANT:
+        best = max(reached, key=lambda asked: (sum(asked.successes or []), np.mean(asked.returns)))
+        solved = "" if best.successes is None else f" and solved {sum(best.successes)} of {n_episodes}"
+        return f"Asked for {best.target:g} it did best: it returned {np.mean(best.returns):,.6g} on average{solved}."
+    span = f"{reached[0].target:,.6g} to {reached[-1].target:,.6g}"
+    if n_episodes < FEWEST_EPISODES or np.ptp(means) > np.sqrt(returns.var(axis=1, ddof=1).mean()):
+        more = max(4 * n_episodes, 20)
+        return f"It takes more episodes to tell whether asking for {span} changes the return: --episodes {more}."
+    unchanged = f"Asking for {span} changes the return by less than its spread between episodes"
+    return f"{unchanged}: this model copies the data whatever it is asked for."
+
+
+def chance(returns: np.ndarray) -> float:
+    """
+    A permutation test of the means against the spread between episodes, be it by their initial states or not.
+
+    :param returns: (R, E) for each of R returns asked for, of E episodes
+    :return: share of the ways to shuffle all returns by which the R means differ at least as much, in (0, 1]
+    """
+    rng = np.random.default_rng(0)
+    shuffled = rng.permuted(np.tile(returns.ravel(), (N_SHUFFLES, 1)), axis=1).reshape(N_SHUFFLES, *returns.shape)
+    as_much = shuffled.mean(axis=2).var(axis=1) >= (1.0 - 1e-9) * returns.mean(axis=1).var()
+    return (1 + np.count_nonzero(as_much)) / (1 + N_SHUFFLES)
 
 
 def draw(curves: dict[str, list[Asked]], recorded: np.ndarray, output: Path, title: str) -> Path:

@@ -8,11 +8,19 @@ from sb3_dtfm.data.lerobot import load_lerobot
 from sb3_dtfm.data.minari import load_minari
 from sb3_dtfm.data.readers import Dataset, load_dataset
 from sb3_dtfm.data.robomimic import load_robomimic
-from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, check_action_space, returns_to_go
+from sb3_dtfm.data.trajectories import (
+    DatasetError,
+    ReturnReference,
+    ScoreReference,
+    Trajectory,
+    check_action_space,
+    returns_to_go,
+)
 
 __all__ = [
     "Dataset",
     "DatasetError",
+    "ReturnReference",
     "ScoreReference",
     "Statistics",
     "Trajectory",

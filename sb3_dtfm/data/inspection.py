@@ -8,6 +8,7 @@ from gymnasium import spaces
 
 from sb3_dtfm.actions import bounds_of, vector_space
 from sb3_dtfm.data.buffer import TrajectoryBuffer
+from sb3_dtfm.data.trajectories import ReturnReference
 
 # Below this share of the range of actions that the data use, learning is in a corner of it.
 NARROW = 0.1
@@ -18,6 +19,13 @@ FAR = 100.0
 FEW_EPISODES = 20
 # Whose mean return is to be asked for.
 BEST_SHARE = 0.1
+# Returns tell the start rather than the quality where the first observation explains this share of their variance.
+START_DECIDES = 0.5
+# Below ten episodes chance explains as much. Of more than 500, which take a tenth of a second, 500 are looked at.
+FEWEST_STARTS, MOST_STARTS = 10, 500
+# Of the regression on first observations. Starts are alike within this many standard deviations of each dimension. The noise
+# is a share of the returns' variance; none of both is fitted, so that noise explains less than half of ten returns, too.
+START_WIDTH, START_NOISE = 2.0, 0.3
 
 
 class Range(NamedTuple):
@@ -36,7 +44,7 @@ class Inspection(NamedTuple):
     :param observations: of O dimensions
     :param actions: of A dimensions, in the environment's range; of a Discrete space's n actions, whose mean is a share
     :param at_bounds: share of all actions' entries at a bound of the action space, of no meaning for Discrete ones
-    :param target_return: to ask for, see :func:`suggest_target_return`
+    :param target_return: see :func:`suggested_target_return`
     :param remarks: sentences about what may be wrong
     """
 
@@ -61,16 +69,57 @@ def inspect_buffer(buffer: TrajectoryBuffer) -> Inspection:
     margin = AT_BOUND * (high - low)
     at_bounds = float(((values <= low + margin) | (values >= high - margin)).float().mean())
     remarks = [*_of_episodes(buffer), *_of_observations(observations), *_of_actions(buffer, actions, at_bounds)]
-    return Inspection(observations, actions, at_bounds, suggest_target_return(buffer), remarks)
+    return Inspection(observations, actions, at_bounds, suggested_target_return(buffer), remarks)
 
 
-def suggest_target_return(buffer: TrajectoryBuffer) -> float:
+def suggested_target_return(buffer: TrajectoryBuffer) -> float:
     """
-    The mean return of the best tenth of the episodes, four digits, environment reward units.
+    A return to ask for: the mean of the best tenth of the episodes; of all episodes where the start decides their returns,
+    since the best tenth had the luckiest starts then.
+
+    :param buffer: as it would be learned from
+    :return: environment reward units, four digits
+    """
+    decided = explained_by_start(buffer) >= START_DECIDES
+    chosen = buffer if decided else buffer.best(best_share=BEST_SHARE)
+    return float(f"{chosen.episode_returns.mean():.4g}")
+
+
+def return_reference(buffer: TrajectoryBuffer) -> ReturnReference:
+    """
+    What the returns of a model are compared with.
 
     :param buffer: as it is learned from
+    :return: without the return of random actions, which only an environment tells
     """
-    return float(f"{buffer.best(best_share=BEST_SHARE).episode_returns.mean():.4g}")
+    best, rate = buffer.best(best_share=BEST_SHARE).episode_returns.mean(), buffer.successes.mean()
+    success_rate = None if np.isnan(rate) else float(rate)
+    return ReturnReference(float(buffer.episode_returns.mean()), float(best), buffer.n_episodes, success_rate)
+
+
+def explained_by_start(buffer: TrajectoryBuffer) -> float:
+    """
+    Share of the returns' variance that first observations explain: a Gaussian process predicts each episode's return from
+    those of all others (Rasmussen and Williams, 2006, equation 5.12).
+
+    :param buffer: of any number of episodes, of which those that are there twice count once
+    :return: in [0, 1]; 0 for fewer than ten episodes
+    """
+    starts = buffer.observations.index_select(0, th.from_numpy(buffer.episodes.starts).to(buffer.observations.device))
+    table = np.unique(np.column_stack([buffer.episode_returns, starts.cpu()]), axis=0)
+    table = table[np.linspace(0, len(table) - 1, min(len(table), MOST_STARTS)).astype(int)]
+    deviations = table - table.mean(axis=0)
+    std = deviations.std(axis=0)
+    if len(table) < FEWEST_STARTS or not std[0]:
+        return 0.0
+    scaled = deviations[:, 1:] / np.where(std[1:] > 0, std[1:], 1.0)
+    products, width = scaled @ scaled.T, START_WIDTH**2 * max(1, np.count_nonzero(std[1:]))
+    alike = np.exp((products - 0.5 * (np.diag(products)[:, None] + np.diag(products))) / width)
+    # The 1 that is added has the mean predicted, too.
+    inverse = np.linalg.inv(1.0 + alike + START_NOISE * np.eye(len(table)))
+    residuals = inverse @ deviations[:, 0] / np.diag(inverse)
+    by_the_mean = deviations[:, 0] * len(table) / (len(table) - 1)
+    return float(max(0.0, 1.0 - np.square(residuals).sum() / np.square(by_the_mean).sum()))
 
 
 def _range(values: th.Tensor) -> Range:
@@ -100,6 +149,10 @@ def _of_episodes(buffer: TrajectoryBuffer) -> list[str]:
         remarks.append("No episode has any return, so that asking for one says nothing.")
     elif np.ptp(returns) == 0:
         remarks.append(f"All returns are {returns[0]:g}: the policy copies what it sees, whatever it is asked for.")
+    explained = explained_by_start(buffer)
+    if explained >= START_DECIDES:
+        start = f"Returns depend on how an episode starts ({100 * explained:.0f} % of their variance)"
+        remarks.append(f"{start}: asking for the best asks for the luckiest start.")
     return remarks
 
 

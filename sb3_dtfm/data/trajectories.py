@@ -130,6 +130,35 @@ class ScoreReference(NamedTuple):
         return (episode_return - self.minimum) / (self.maximum - self.minimum)
 
 
+class ReturnReference(NamedTuple):
+    """
+    What the episodes of a model are compared with.
+
+    :param recorded: mean return of the recorded episodes, environment reward units
+    :param best_tenth: mean return of the best tenth of them, environment reward units
+    :param n_episodes: number of recorded episodes
+    :param success_rate: share of them that succeeded, in [0, 1]; None where the data do not tell
+    :param random: mean return of random actions, environment reward units; None where it was not measured
+    """
+
+    recorded: float
+    best_tenth: float
+    n_episodes: int
+    success_rate: float | None = None
+    random: float | None = None
+
+    def share(self, episode_return: float) -> float | None:
+        """
+        How far a return is on the way from random actions to what was recorded.
+
+        :param episode_return: environment reward units
+        :return: 0 for random actions, 1 for the recorded mean; None where random actions are not known to be worse
+        """
+        if self.random is None or self.recorded <= self.random:
+            return None
+        return (episode_return - self.random) / (self.recorded - self.random)
+
+
 def returns_to_go(rewards: np.ndarray) -> np.ndarray:
     """
     Undiscounted return from each step to the end of one episode.

@@ -12,8 +12,10 @@ import rl_zoo3.enjoy
 import rl_zoo3.train
 import rl_zoo3.utils
 from huggingface_sb3 import EnvironmentName
-from rl_zoo3.utils import get_model_path
+from rl_zoo3.utils import create_test_env, get_model_path
 
+from sb3_dtfm.files import holds_pickles, read_configuration
+from sb3_dtfm.zoo.comparison import EpisodesOf, compare
 from sb3_dtfm.zoo.finetuning import OnlineManager, SteeringManager
 from sb3_dtfm.zoo.manager import OfflineExperimentManager
 from sb3_dtfm.zoo.registration import ONLINE
@@ -76,13 +78,29 @@ def finetune(
 
 def enjoy(arguments: Sequence[str]) -> None:
     """
-    Act with a trained model.
+    Act with a trained model, and compare its episodes with those that it learned from.
 
     :param arguments: of RL-Zoo's `enjoy`
     :raises FileNotFoundError: no such run, or no such model in it
     """
-    rl_zoo3.enjoy.get_model_path = find_model
+    found: list[tuple[FoundModel, EnvironmentName]] = []
+    envs: list[EpisodesOf] = []
+
+    def find(exp_id: int, folder: str, algo: str, env_name: EnvironmentName, *args: Any) -> FoundModel:
+        found.append((find_model(exp_id, folder, algo, env_name, *args), env_name))
+        return found[-1][0]
+
+    def make(*args: Any, **kwargs: Any) -> EpisodesOf:
+        envs.append(EpisodesOf(create_test_env(*args, **kwargs)))
+        return envs[-1]
+
+    rl_zoo3.enjoy.get_model_path = find  # type: ignore[assignment]
+    rl_zoo3.enjoy.create_test_env = make
     _call(rl_zoo3.enjoy.enjoy, "enjoy", arguments)
+    model, env_name = found[-1]
+    if not holds_pickles(model.path):  # those of RL-Zoo's own algorithms
+        attributes = read_configuration(model.path)["attributes"]
+        print("\n".join(compare(attributes, envs[-1].returns, envs[-1].successes, Path(model.run), env_name)))
 
 
 def record_video(model: FoundModel, arguments: Sequence[str]) -> None:

@@ -23,6 +23,7 @@ from sb3_dtfm.arguments import with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.distributed import is_first_process
 from sb3_dtfm.zoo.arguments import UsageError
+from sb3_dtfm.zoo.comparison import MeasureRandomActions, compare
 from sb3_dtfm.zoo.registration import with_policy_options
 from sb3_dtfm.zoo.resuming import CHECKPOINT, KeepCheckpoint, ReplaceEvaluations, Start, StopSignals, go_on
 
@@ -42,6 +43,7 @@ class OfflineExperimentManager(ExperimentManager):
     - dt and dtfm are evaluated before the first gradient step and after the last one too.
     - Of the processes of one training, the first alone runs callbacks.
     - They keep a checkpoint while they train, and a run goes on from it.
+    - What the last evaluation reached is compared with what was recorded.
 
     :param arguments: what the command was called with
     :param resumed: folder of a run to go on with, instead of a new one
@@ -54,6 +56,7 @@ class OfflineExperimentManager(ExperimentManager):
         self.valueless: list[str] = []  # why trials of a search have no value
         self.signals = StopSignals(between_steps=self.algo in ALGORITHMS)
         self.keeper: KeepCheckpoint | None = None
+        self.evaluations: list[EvalCallback] = []  # of dt and dtfm
         # RL-Zoo draws a seed where none is given; the last one that is given counts.
         self.start = Start([*arguments, "--seed", str(self.seed)], command=self.command)
         self.resumed = resumed
@@ -131,7 +134,8 @@ class OfflineExperimentManager(ExperimentManager):
             return
         evaluations = [callback for callback in self.callbacks if isinstance(callback, EvalCallback)]
         first = self.callbacks.index(evaluations[0]) if evaluations else 0
-        self.callbacks.insert(first, SeedEvaluations(evaluations, self.seed))
+        self.callbacks[first:first] = [MeasureRandomActions(evaluations, self.seed), SeedEvaluations(evaluations, self.seed)]
+        self.evaluations = evaluations
         self.keeper = KeepCheckpoint(Path(self.save_path), self.signals, self.start)
         self.callbacks += [EvaluateAtStartAndEnd(evaluations), ReplaceEvaluations(evaluations), self.keeper]
 
@@ -184,5 +188,8 @@ class OfflineExperimentManager(ExperimentManager):
             )
         if self.keeper is not None:
             self.keeper.release()
+        for evaluation in self.evaluations[-1:] if ended and self.verbose > 0 else []:
+            reached = [evaluation.last_mean_reward], evaluation._is_success_buffer
+            print("\n".join(compare(vars(model), *reached, Path(self.save_path), self.env_name)))
         if self.signals.terminated and not ended:
             raise SystemExit(128 + signal.SIGTERM)

@@ -63,6 +63,17 @@ def test_every_fault_is_remarked():
     ]
 
 
+def test_where_the_start_decides_the_command_asks_for_the_mean(workplace, capsys):
+    given = arrays()
+    given["observations"][::4, 0] = np.arange(30)
+    np.savez("starts.npz", **given)
+    assert main(["inspect", "starts.npz"]) == 0
+    text = capsys.readouterr().out
+    assert "- Returns depend on how an episode starts (9" in text
+    assert "% of their variance): asking for the best asks for the luckiest start.\n" in text
+    assert "--target-return 14.5\n" in text
+
+
 def test_the_command_shows_a_table_a_picture_and_a_command_that_trains(workplace, capsys):
     assert main(["inspect", DATASET_ID, "-o", "figures/found.png"]) == 0
     text = capsys.readouterr().out

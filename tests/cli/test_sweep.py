@@ -9,7 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from sb3_dtfm.cli.main import main
-from sb3_dtfm.cli.sweep import Asked, distinguished, draw, evenly, table
+from sb3_dtfm.cli.sweep import Asked, chance, distinguished, draw, evenly, finding, table
 from tests.recorded import DATASET_ID, tiny_training
 
 SWEEP = ["--env", "HalfCheetah-v5", "--dataset", DATASET_ID, "--episodes", "2", "--env-kwargs", "max_episode_steps:20"]
@@ -26,6 +26,9 @@ def test_two_models_are_asked_for_the_range_of_their_data(workplace, capsys):
     assert header == "| asked | DT, HalfCheetah-v5_1 | DTFM, HalfCheetah-v5 |"
     assert len(rows) == 3
     assert all(re.fullmatch(r"\| -?[\d.]+ \|( -?[\d.]+ \[-?[\d.]+, -?[\d.]+\] \|){2}", row) for row in rows)
+    found = [line for line in text.splitlines() if line.startswith("- ")]
+    assert [line.split(": ")[0] for line in found] == ["- DT, HalfCheetah-v5_1", "- DTFM, HalfCheetah-v5"]
+    assert all("It takes more episodes" in line for line in found), "two episodes tell nothing"
     assert (workplace / "figures" / "sweep.png").stat().st_size > 10_000
     numbers = json.loads((workplace / "figures" / "sweep.json").read_text())
     assert numbers["task"] == "HalfCheetah-v5"
@@ -102,3 +105,40 @@ def test_the_table_and_the_picture_say_what_was_reached(tmp_path, monkeypatch):
     assert asked.get_ydata().tolist() == [1, 5]
     assert [line.get_ydata().tolist() for line in models] == [[2, 4], [1, 5]]
     assert [text.get_text() for text in drawn[0].axes[0].get_legend().get_texts()] == ["what was asked for", "DT", "DTFM"]
+
+
+def asked(effect: float, n_episodes: int = 10, seed: int = 0, successes=None) -> list[Asked]:
+    """A model whose return is the episode's start, of a standard deviation of 100, and a share of what it is asked for."""
+    starts = 100.0 * np.random.default_rng(seed).normal(size=n_episodes)
+    targets = [500.0, 1000.0, 2000.0, 3700.0]
+    told = [None] * len(targets) if successes is None else successes
+    return [Asked(target, (starts + effect * target).tolist(), each) for target, each in zip(targets, told, strict=True)]
+
+
+def test_a_model_that_follows_what_it_is_asked_for_is_told_what_is_best():
+    assert re.fullmatch(r"Asked for 3700 it did best: it returned [\d,.]+ on average\.", finding(asked(1.0)))
+    assert "Asked for 500 it did best" in finding(asked(-1.0))
+    solved = [[True] * n + [False] * (10 - n) for n in (1, 9, 2, 3)]
+    assert "Asked for 1000 it did best" in finding(asked(1.0, successes=solved)), "a success counts more than a return"
+    assert finding(asked(1.0, successes=solved)).endswith("and solved 9 of 10.")
+
+
+@pytest.mark.parametrize("effect", [0.0, 0.002, -0.002])
+def test_a_model_that_follows_by_less_than_episodes_differ_copies(effect):
+    """Even where each episode changes a little in the same direction, as deterministic acting from the same start does."""
+    assert finding(asked(effect)) == (
+        "Asking for 500 to 3,700 changes the return by less than its spread between episodes: "
+        "this model copies the data whatever it is asked for."
+    )
+
+
+def test_few_episodes_say_nothing():
+    more = "It takes more episodes to tell whether asking for 500 to 3,700 changes the return: --episodes 20."
+    assert [finding(asked(0.0, n)) for n in (1, 5)] == [more, more]
+
+
+def test_chance_is_found_as_often_as_it_is_said_to_be():
+    rng = np.random.default_rng(0)
+    found = np.array([chance(rng.exponential(size=(5, 8))) for _ in range(200)])
+    assert 0.01 <= (found < 0.05).mean() <= 0.1
+    assert chance(np.ones((3, 9))) == 1.0

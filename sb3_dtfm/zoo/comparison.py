@@ -1,0 +1,148 @@
+"""A model's episodes beside those that it learned from, which `train` and `enjoy` compare in the end."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from huggingface_sb3 import EnvironmentName
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+
+from sb3_dtfm.data import ReturnReference
+from sb3_dtfm.envs.success import reported_success
+from sb3_dtfm.files import read_run
+
+# Below this share of what was recorded there is something to try.
+ENOUGH = 0.9
+# Fewer recorded episodes than this may be learned by heart.
+FEW_EPISODES = 50
+N_RANDOM_EPISODES = 5
+
+
+class RandomActions:
+    """
+    Acts at random, where SB3's `evaluate_policy` expects a model.
+
+    :param env: whose actions are drawn
+    :param seed: of the draws
+    """
+
+    def __init__(self, env: VecEnv, seed: int) -> None:
+        self.n_envs, self.space = env.num_envs, env.action_space
+        self.space.seed(seed)
+
+    def predict(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, None]:
+        """An action for each environment, whatever is observed."""
+        return np.stack([self.space.sample() for _ in range(self.n_envs)]), None
+
+
+class MeasureRandomActions(BaseCallback):
+    """
+    Measure in the environment of the evaluations what random actions return, for the model's `return_reference`.
+
+    It is measured before training, so that every saved model knows it. Put it before the callbacks that evaluate and their
+    :class:`~sb3_dtfm.callbacks.SeedEvaluations`.
+
+    :param eval_callbacks: the evaluations, of which the first counts
+    :param seed: of the actions
+    """
+
+    def __init__(self, eval_callbacks: list[EvalCallback], seed: int) -> None:
+        super().__init__()
+        self.eval_callbacks = eval_callbacks
+        self.seed = seed
+
+    def _on_training_start(self) -> None:
+        model: Any = self.model
+        for evaluation in self.eval_callbacks[:1]:
+            random: Any = RandomActions(evaluation.eval_env, self.seed)
+            mean: Any = evaluate_policy(random, evaluation.eval_env, N_RANDOM_EPISODES)[0]
+            model.return_reference = model.return_reference._replace(random=float(mean))
+
+    def _on_step(self) -> bool:
+        return True
+
+
+class EpisodesOf(VecEnvWrapper):
+    """
+    Keeps the returns and successes of an environment's episodes.
+
+    :ivar returns: of the episodes that have ended, environment reward units
+    :ivar successes: whether they succeeded; empty where the task does not tell
+    """
+
+    def __init__(self, venv: VecEnv) -> None:
+        super().__init__(venv)
+        self.returns: list[float] = []
+        self.successes: list[bool] = []
+
+    def reset(self) -> Any:
+        return self.venv.reset()
+
+    def step_wait(self) -> Any:
+        observations, rewards, dones, infos = self.venv.step_wait()
+        for info in (infos[i] for i in np.flatnonzero(dones)):
+            self.returns.append(info["episode"]["r"])  # the monitor's, of which no wrapper has changed the rewards
+            if (success := reported_success(info)) is not None:
+                self.successes.append(success)
+        return observations, rewards, dones, infos
+
+
+def compare(
+    attributes: Mapping[str, Any], returns: Sequence[float], successes: Sequence[bool], run: Path, env_name: EnvironmentName
+) -> list[str]:
+    """
+    Compare a model's episodes with those that it learned from, and name two things to try where they reach less than nine
+    tenths of these. Success decides that where both tell of it.
+
+    :param attributes: of the model, or of its file
+    :param returns: of its episodes, environment reward units
+    :param successes: whether they succeeded; none where the task does not tell
+    :param run: folder of its run
+    :param env_name: of its environment
+    :return: sentences; none where there are no episodes, or where the model does not know what was recorded
+    """
+    if attributes.get("return_reference") is None or not len(returns):
+        return []
+    reference = ReturnReference(*attributes["return_reference"])
+    reached = float(np.mean(returns))
+    share = reference.share(reached)
+    random = "" if reference.random is None else f"random {four_digits(reference.random)}, "
+    recorded = f"{four_digits(reference.recorded)} (best tenth {four_digits(reference.best_tenth)})"
+    of_it = "" if share is None else f": {_percent(share)} of what was recorded"
+    sentences = [f"Recorded {recorded}, {random}reached {four_digits(reached)}{of_it}."]
+    if reference.success_rate and len(successes):
+        rate = float(np.mean(successes))
+        share = rate / reference.success_rate
+        sentences.append(
+            f"{_percent(reference.success_rate)} of the recorded episodes succeeded, {_percent(rate)} of these."
+        )
+    if share is not None and share < ENOUGH:
+        sentences += _to_try(attributes, reference, run, env_name)
+    return sentences
+
+
+def _to_try(attributes: Mapping[str, Any], reference: ReturnReference, run: Path, env_name: EnvironmentName) -> list[str]:
+    """Two commands, or options of `train`."""
+    n_steps = attributes["_total_timesteps"]
+    dropout = (attributes.get("policy_kwargs") or {}).get("dropout")
+    if reference.n_episodes < FEW_EPISODES and dropout == 0:
+        first = (
+            f"Learning {reference.n_episodes} episodes by heart may be what hinders: -params dropout:0.1 makes that harder."
+        )
+    else:
+        first = f"Longer training may help: -n {2 * n_steps} instead of {n_steps}."
+    dataset = read_run(run / env_name).get("dataset")
+    name = dataset if isinstance(dataset, str) else "DATASET"
+    return [first, f"Which return is best to ask for: sb3-dtfm sweep {run} --env {env_name.gym_id} --dataset {name}"]
+
+
+def four_digits(number: float) -> str:
+    """A number as a table shows it: 3,727 or 0.1235."""
+    return f"{float(f'{number:.4g}'):,.12g}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"
