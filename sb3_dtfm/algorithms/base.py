@@ -290,7 +290,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
             return
         share_target_return(self.env, target_return)
         if self.verbose >= 1 and is_first_process():
-            what = "the mean return of the best tenth of the recorded episodes"
+            what = "as `sb3-dtfm inspect` suggests of the recorded returns"
             print(f"The environment asks for target_return={target_return:g}, {what}.", flush=True)
 
     def _check_spaces(self, observation_space: spaces.Space, action_space: ActionSpace, found: str, expected: str) -> None:

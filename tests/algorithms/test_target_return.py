@@ -41,7 +41,7 @@ def test_any_environment_asks_for_what_inspect_suggests(env, cheetah_buffer, cap
     model = make_model(DTFM, cheetah_buffer, env=env if isinstance(env, str) else env(), verbose=1)
     assert (model.target_return, targets(model.get_env())) == (suggested, [suggested])
     said = capsys.readouterr().out
-    assert f"asks for target_return={suggested:g}, the mean return of the best tenth of the recorded episodes." in said
+    assert f"asks for target_return={suggested:g}, as `sb3-dtfm inspect` suggests of the recorded returns." in said
     assert ("Wrapping the env in a ReturnToGoWrapper." in said) is (env is not make_env_without_target)
     assert model.get_env().reset()["return_to_go"] == np.float32(suggested)
 
