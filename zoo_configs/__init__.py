@@ -1,0 +1,19 @@
+"""Packaged settings: YAML files as RL-Zoo reads them, and the method's paper's as constructor arguments."""
+
+from importlib import resources
+from typing import Any
+
+import yaml
+
+
+def paper_settings(algo: str) -> dict[str, Any]:
+    """
+    The settings of the method's paper: `DTFM(env=env, dataset=dataset, **paper_settings("dtfm"))`.
+
+    :param algo: "dt" or "dtfm"
+    :return: arguments of the class, `policy` among them; for 150,000 gradient steps
+    :raises FileNotFoundError: another name
+    """
+    text = resources.files("sb3_dtfm.zoo_configs.paper").joinpath(f"{algo}.yml").read_text()
+    default: dict[str, Any] = yaml.safe_load(text)["default"]
+    return {name: value for name, value in default.items() if name != "n_timesteps"}

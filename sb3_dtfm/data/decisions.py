@@ -58,7 +58,8 @@ def _kind_of_actor(buffer: TrajectoryBuffer) -> list[Decision]:
     plans = ratio > 1.0
     # The trunk learns by the loss of what acts: the flow's, or the regression's.
     flow = {"n_solver_steps": FLOW_STEPS if plans else 0, "regression_coef": 0.0 if plans else 1.0}
-    settings = {"chunk_size": CHUNK_SIZE if plans else 1, **flow, "calm_units": not plans}
+    # A plan has a clock: ten demonstrations of Lift are learned twice as well with it. An agent has none.
+    settings = {"chunk_size": CHUNK_SIZE if plans else 1, **flow, "timestep_embedding": plans, "calm_units": not plans}
     better, worse = ("the previous action", "the observation") if plans else ("the observation", "the previous action")
     times = max(ratio, 1.0 / max(ratio, 1e-3))
     reason = f"{better.capitalize()} predicts an action better than {worse} (squared error {times:.1f} times smaller)."

@@ -2,12 +2,11 @@
 
 import pytest
 import torch as th
-import yaml
 from torch.utils.flop_counter import FlopCounterMode
 
 from sb3_dtfm import DTFM
 from sb3_dtfm.optimization import ONE_THREADS_PRODUCTS, threads_that_pay
-from sb3_dtfm.zoo.registration import packaged_config
+from sb3_dtfm.zoo_configs import paper_settings
 
 
 @pytest.mark.parametrize(
@@ -29,9 +28,8 @@ def test_little_work_is_done_by_one_thread_unless_the_user_says_how_many(n_produ
 
 def test_the_default_is_little_work_and_the_papers_settings_are_not(cheetah_buffer):
     """Multiplications of a gradient step, as torch counts half of its floating-point operations."""
-    paper = yaml.safe_load(packaged_config("dtfm", "paper").read_text())["default"]
-    del paper["n_timesteps"]
-    for large, settings in ((False, {"policy": "MultiInputPolicy"}), (True, {**paper, "precision": "float32"})):
+    paper = {**paper_settings("dtfm"), "precision": "float32"}
+    for large, settings in ((False, {"policy": "MultiInputPolicy"}), (True, paper)):
         model = DTFM(dataset=cheetah_buffer, **settings)
         with FlopCounterMode(display=False) as counter:
             model.learn(1)
