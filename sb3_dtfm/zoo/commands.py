@@ -100,7 +100,8 @@ def enjoy(arguments: Sequence[str]) -> None:
     model, env_name = found[-1]
     if not holds_pickles(model.path):  # those of RL-Zoo's own algorithms
         attributes = read_configuration(model.path)["attributes"]
-        print("\n".join(compare(attributes, envs[-1].returns, envs[-1].successes, Path(model.run), env_name)))
+        for sentence in compare(attributes, envs[-1].returns, envs[-1].successes, Path(model.run), env_name):
+            print(sentence)
 
 
 def record_video(model: FoundModel, arguments: Sequence[str]) -> None:

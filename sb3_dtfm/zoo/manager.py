@@ -190,6 +190,7 @@ class OfflineExperimentManager(ExperimentManager):
             self.keeper.release()
         for evaluation in self.evaluations[-1:] if ended and self.verbose > 0 else []:
             reached = [evaluation.last_mean_reward], evaluation._is_success_buffer
-            print("\n".join(compare(vars(model), *reached, Path(self.save_path), self.env_name)))
+            for sentence in compare(vars(model), *reached, Path(self.save_path), self.env_name):
+                print(sentence)
         if self.signals.terminated and not ended:
             raise SystemExit(128 + signal.SIGTERM)
