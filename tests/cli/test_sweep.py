@@ -52,7 +52,7 @@ def test_two_models_are_asked_for_the_range_of_their_data(workplace, capsys):
     (as_saved, _) = json.loads((workplace / "figures" / "again.json").read_text())["models"].values()
     assert asked[0]["target"] == as_saved[0]["target"]
     assert asked[0]["returns"] != as_saved[0]["returns"]
-    assert main(["sweep", *slower, "n_solver_steps:0"]) == 2
+    assert main(["sweep", *slower, "n_solver_steps:-1"]) == 2
     assert main(["sweep", *slower, "speed:7"]) == 2
     errors = capsys.readouterr().err
     assert "--acting: n_solver_steps" in errors
