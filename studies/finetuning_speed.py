@@ -4,7 +4,7 @@ Steps a second that environments make alone, and behind what `sb3-dtfm finetune`
     OMP_NUM_THREADS=1 python studies/finetuning_speed.py --env robosuite/Lift-v0 --n-envs 1 2 --vec-env subproc -o rows.jsonl
 
 `attempts` are those that a DTFM makes to learn from them, `wrapped` chooses at random what an algorithm would, `learning` is
-the algorithm itself with its packaged settings. One thread for each process. The model has the small profile's sizes and no
+the algorithm itself with its packaged settings. One thread for each process. The model has the packaged sizes and no
 training: what it computes is the same.
 """
 
@@ -45,7 +45,7 @@ def settings_of(path: Path, env_id: str) -> dict[str, Any]:
 
 
 def make_model(env_id: str) -> DTFM:
-    """A model of the small profile, of two random episodes."""
+    """A model of the packaged size, of two random episodes."""
     env = gym.make(env_id)
     rng = np.random.default_rng(0)
     space = env.observation_space
@@ -53,9 +53,11 @@ def make_model(env_id: str) -> DTFM:
     actions = rng.uniform(env.action_space.low, env.action_space.high, (20, *env.action_space.shape))
     episodes = [dict(observations=rng.normal(size=sizes), actions=actions, rewards=np.ones(20)) for _ in range(2)]
     env.close()
-    settings = settings_of(packaged_config("dtfm", "small"), env_id)
+    settings = settings_of(packaged_config("dtfm"), env_id)
     settings = {name: value for name, value in settings.items() if name in OF_THE_MODEL}
-    return DTFM("MultiInputPolicy", dataset=episodes, seed=0, device="cpu", **settings)
+    chunk_size = 8 if env_id.startswith("robosuite/") else 1  # as their recordings decide
+    policy_kwargs = {"chunk_size": chunk_size, **settings.pop("policy_kwargs", {})}
+    return DTFM("MultiInputPolicy", dataset=episodes, seed=0, device="cpu", policy_kwargs=policy_kwargs, **settings)
 
 
 def make_envs(env_id: str, n_envs: int, vec_env: str) -> VecEnv:

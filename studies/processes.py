@@ -16,7 +16,7 @@ import tempfile
 
 N_ROUNDS = 3
 RATE = re.compile(r"steps_per_second\s*\|\s*([\d.]+)")
-TRAINING = ["train", "--algo", "dtfm", "--env", "HalfCheetah-v5", "--conf-file", "small", "--eval-freq", "-1"]
+TRAINING = ["train", "--algo", "dtfm", "--env", "HalfCheetah-v5", "--eval-freq", "-1"]
 # Of each size, the gradient steps of a run and what `sb3-dtfm train` is told beside them.
 SIZES = {
     "small profile": (300, []),

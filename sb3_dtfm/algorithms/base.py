@@ -55,7 +55,7 @@ SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineAlgorithm")
 # The names of an algorithm's one policy: Stable-Baselines3's for dictionaries, which is what it observes, and for vectors.
 POLICY_NAMES = ("MultiInputPolicy", "MlpPolicy")
 ACCEPTED: dict[str, Rule] = {
-    "batch_size": COUNT,
+    "batch_size": COUNT._replace(optional=True),
     "weight_decay": NOT_NEGATIVE,
     "context_length": Number(low=1, high=100_000, whole=True),
     "dataset_fraction": Number(low=0, high=1, above_low=True),
@@ -85,7 +85,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         memory: a dictionary of arrays, a list of episodes, an SB3 `ReplayBuffer`, a
         :class:`~sb3_dtfm.data.TrajectoryBuffer`; see :func:`~sb3_dtfm.data.load_dataset`
     :param learning_rate: AdamW's, a number or a function of the progress remaining (from 1 to 0)
-    :param batch_size: windows in a gradient step, of all processes together
+    :param batch_size: windows in a gradient step, of all processes together; by default 64 of less than 10,000 recorded
+        steps, and 256 of more
     :param weight_decay: AdamW's, on weight matrices only
     :param context_length: K, steps the policy sees
     :param dataset_fraction: share of the episodes to learn from, randomly drawn
@@ -131,7 +132,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         env: GymEnv | str | None = None,
         dataset: Dataset | None = None,
         learning_rate: float | Schedule = 1e-3,
-        batch_size: int = 256,
+        batch_size: int | None = None,
         weight_decay: float = 1e-3,
         context_length: int = 1,
         dataset_fraction: float = 1.0,
@@ -172,7 +173,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
             self._policy_class.head_for(self.action_space)  # before the data are read, which may take long
             self.target_return = share_target_return(self.env, None)
         self.dataset = dataset
-        self.batch_size = batch_size
+        self.batch_size: int = batch_size  # type: ignore[assignment]  # None until the data have decided
         self.weight_decay = weight_decay
         self.context_length = context_length
         self.dataset_fraction = dataset_fraction
@@ -217,8 +218,11 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         """Have the data decide of the policy's arguments what the user has left open; they are saved with the others."""
         given = self.policy_kwargs or {}
         names = self._policy_class.parameter_names() - set(given)
+        names |= {"batch_size"} if self.batch_size is None else set()
         self.decisions = [each for each in decide(buffer) if each.name in names]
-        self.policy_kwargs = {**{each.name: each.value for each in self.decisions}, **given}
+        values = {each.name: each.value for each in self.decisions}
+        self.batch_size = values.pop("batch_size", self.batch_size)
+        self.policy_kwargs = {**values, **given}
 
     def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
         """
@@ -237,7 +241,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
             self.learning_rate.check()
         accepted = ACCEPTED if callable(self.learning_rate) else {**ACCEPTED, "learning_rate": learning_rate}
         vars(self).update(check_arguments(vars(self), accepted))
-        check_batch_size(self.batch_size)
+        if self.batch_size is not None:
+            check_batch_size(self.batch_size)
 
     def set_dataset(self, dataset: Dataset) -> None:
         """

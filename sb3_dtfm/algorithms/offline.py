@@ -17,6 +17,7 @@ from sb3_dtfm.algorithms.base import OfflineAlgorithm
 from sb3_dtfm.arguments import POSITIVE
 from sb3_dtfm.callbacks import GradientStepProgressBar, NormalizedScoreCallback, TimeLeft, find_eval_callbacks
 from sb3_dtfm.data import TrajectoryBuffer
+from sb3_dtfm.data.decisions import sentences
 from sb3_dtfm.distributed import DataParallel, LossFunction, is_first_process, n_processes
 from sb3_dtfm.envs import check_vec_env, share_target_return
 from sb3_dtfm.optimization import (
@@ -138,9 +139,8 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
             epochs = n_steps * self.batch_size / len(buffer)
             sizes = f"{n_steps:,} gradient steps of {self.batch_size} windows"
             print(f"{sizes}: {epochs:.1f} epochs of {len(buffer):,} recorded steps", flush=True)
-            for reason in dict.fromkeys(each.reason for each in self.decisions):
-                chosen = ", ".join(f"{each.name}={each.value}" for each in self.decisions if each.reason == reason)
-                print(f"{reason} So {chosen}.", flush=True)
+            for sentence in sentences(self.decisions):
+                print(sentence, flush=True)
         batches = self._batches(buffer, self.batch_size)
         callback.on_training_start(locals(), globals())
         parallel.from_first(True)  # which may evaluate for longer than a gradient step's messages wait

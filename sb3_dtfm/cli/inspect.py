@@ -13,6 +13,7 @@ from gymnasium import spaces
 from sb3_dtfm.actions import ActionSpace
 from sb3_dtfm.cli.literals import key_value
 from sb3_dtfm.data import TrajectoryBuffer, load_dataset
+from sb3_dtfm.data.decisions import decide, sentences
 from sb3_dtfm.data.inspection import Inspection, Range, inspect_buffer
 from sb3_dtfm.envs import register_gymnasium_robotics
 
@@ -38,6 +39,9 @@ def main(argv: Sequence[str]) -> None:
     print("\n".join(table(buffer, found)))
     for remark in found.remarks:
         print(f"- {remark}")
+    print("\nDecided from the data, unless you say otherwise:")
+    for sentence in sentences(decide(buffer)):
+        print(f"- {sentence}")
     print(f"\nTo begin with:\n  {command(options.dataset, options.dataset_kwargs, buffer, found)}")
     print(f"\nPicture: {draw(buffer, found, Path(options.output), ' + '.join(options.dataset))}")
 

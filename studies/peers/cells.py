@@ -53,7 +53,7 @@ class Data(NamedTuple):
     minutes: float
     fraction: float = 1.0
     n_timesteps: int | None = None
-    profile: str = "small"
+    profile: str = "default"
     params: dict[str, Any] = {}  # noqa: RUF012 - never changed
     peers: dict[str, dict[str, Any]] = {}  # noqa: RUF012
     gym_packages: list[str] = []  # noqa: RUF012

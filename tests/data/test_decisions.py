@@ -1,0 +1,78 @@
+"""What the data decide: plans or answers, returns that differ or not, few steps or many."""
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from sb3_dtfm.data import Trajectory, TrajectoryBuffer
+from sb3_dtfm.data.decisions import decide, plan_ratio, sentences
+
+SPACE = spaces.Box(-1.0, 1.0, (2,))
+
+
+def make_buffer(kind: str, n_episodes: int = 20, n_steps: int = 40, spread: float = 1.0) -> TrajectoryBuffer:
+    """
+    Observations that jump about. An agent's action is a function of them; a planner's goes on as it began, whatever it sees.
+
+    :param spread: how far rewards differ between episodes
+    """
+    random = np.random.default_rng(0)
+    episodes = []
+    for number in range(n_episodes):
+        observations = random.normal(size=(n_steps, 3)).astype(np.float32)
+        answers = np.tanh(observations[:, :2]) + random.normal(0.0, 0.05, (n_steps, 2))
+        plan = random.uniform(-0.8, 0.8, 2) + np.cumsum(random.normal(0.0, 0.02, (n_steps, 2)), axis=0)
+        actions = np.clip(answers if kind == "agent" else plan, -1.0, 1.0).astype(np.float32)
+        rewards = np.full(n_steps, 1.0 + spread * number / n_episodes)
+        episodes.append(Trajectory(observations, actions, rewards, truncated=True))
+    return TrajectoryBuffer.from_trajectories(episodes, SPACE)
+
+
+def settings(buffer: TrajectoryBuffer) -> dict:
+    return {each.name: each.value for each in decide(buffer)}
+
+
+def test_an_agents_actions_are_taken_one_by_one_and_at_their_mean():
+    buffer = make_buffer("agent")
+    assert plan_ratio(buffer) < 0.2
+    decided = settings(buffer)
+    assert (decided["chunk_size"], decided["n_solver_steps"], decided["regression_coef"]) == (1, 0, 1.0)
+
+
+def test_a_planners_actions_are_drawn_in_chunks():
+    buffer = make_buffer("planner")
+    assert plan_ratio(buffer) > 5.0
+    decided = settings(buffer)
+    assert (decided["chunk_size"], decided["n_solver_steps"], decided["regression_coef"]) == (8, 10, 0.0)
+    assert decided["timestep_embedding"]
+
+
+def test_a_decision_repeats_and_leaves_the_data_alone():
+    buffer = make_buffer("planner")
+    before = buffer.actions.clone()
+    assert plan_ratio(buffer) == plan_ratio(buffer)
+    assert buffer.actions.equal(before)
+
+
+@pytest.mark.parametrize(("n_episodes", "n_steps"), [(1, 40), (5, 1)], ids=["one episode", "episodes of one step"])
+def test_too_little_to_tell_is_taken_for_an_agents(n_episodes, n_steps):
+    buffer = make_buffer("planner", n_episodes, n_steps)
+    assert plan_ratio(buffer) == 0.0
+    assert settings(buffer)["chunk_size"] == 1
+
+
+def test_returns_that_hardly_differ_are_left_out():
+    assert settings(make_buffer("agent", spread=1.0))["return_conditioning"] is True
+    assert settings(make_buffer("agent", spread=0.05))["return_conditioning"] is False
+
+
+def test_few_steps_make_small_batches():
+    assert settings(make_buffer("agent", 20, 40))["batch_size"] == 64
+    assert settings(make_buffer("agent", 20, 500))["batch_size"] == 256
+
+
+def test_people_are_told_each_reason_once():
+    told = sentences(decide(make_buffer("planner")))
+    assert told[0] == "There are few recorded steps (800). So batch_size=64."
+    assert sum("chunk_size=8" in sentence for sentence in told) == 1
+    assert len(told) == 3
