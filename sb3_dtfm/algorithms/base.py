@@ -74,6 +74,10 @@ ACCEPTED: dict[str, Rule] = {
 }
 
 
+# What acts, and by which loss the trunk learns.
+TRAINED_BY = {"n_solver_steps", "regression_coef"}
+
+
 class OfflineAlgorithm(BaseAlgorithm, ABC):
     """
     A model with the data it learns from: everything of an algorithm but its learn loop.
@@ -219,6 +223,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         given = self.policy_kwargs or {}
         names = self._policy_class.parameter_names() - set(given)
         names |= {"batch_size"} if self.batch_size is None else set()
+        if TRAINED_BY & set(given):  # which belong together
+            names -= TRAINED_BY
         self.decisions = [each for each in decide(buffer) if each.name in names]
         values = {each.name: each.value for each in self.decisions}
         self.batch_size = values.pop("batch_size", self.batch_size)
@@ -251,7 +257,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         :param dataset: as in the constructor
         :raises DatasetError: it cannot be read, or does not fit the model
         """
-        self.dataset = dataset
+        self.dataset, self.decisions = dataset, []
         self._load_buffer()
 
     def _load_buffer(self) -> TrajectoryBuffer:

@@ -1,4 +1,4 @@
-"""Between which returns-to-go recordings went on from an observation."""
+"""Expected range of the return-to-go, given the observation."""
 
 import torch as th
 from torch import nn
@@ -14,8 +14,8 @@ class ReturnRange(nn.Module):
     """
     A lower and an upper expectile of the return-to-go by the observation (Newey and Powell, 1987), in the trunk's units.
 
-    A return-to-go that no recording reached from such an observation is outside of the training data. This matters where the
-    start decides the return, as in Pendulum, and where an agent has fallen and cannot reach the target any more.
+    Returns-to-go outside of it are rare in the training data from such an observation. This matters where the start decides
+    the return, as in Pendulum, and where an agent has fallen and cannot reach the target any more.
 
     :param observation_dim: O
     """
@@ -31,7 +31,7 @@ class ReturnRange(nn.Module):
         :param observations: (B, K, O), normalised
         :param returns_to_go: (B, K), in the trunk's units
         :param mask: (B, K) bool, False on padded steps
-        :return: mean asymmetric squared error over valid steps
+        :return: sum of both expectile losses, mean over valid steps
         """
         missing = returns_to_go.unsqueeze(-1) - self.layers(observations).float()
         above = missing.new_tensor(EXPECTILES)
@@ -42,7 +42,7 @@ class ReturnRange(nn.Module):
         """
         :param observations: (B, K, O), normalised
         :param returns_to_go: (B, K)
-        :return: (B, K), within the range
+        :return: (B, K), clamped to the range
         """
         low, high = self.layers(observations).unbind(-1)
         return returns_to_go.clamp(low, high)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from sb3_dtfm import DTFM
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.data.decisions import decide, plan_ratio, sentences
 
@@ -57,8 +58,9 @@ def test_a_decision_repeats_and_leaves_the_data_alone():
 @pytest.mark.parametrize(("n_episodes", "n_steps"), [(1, 40), (5, 1)], ids=["one episode", "episodes of one step"])
 def test_too_little_to_tell_is_taken_for_an_agents(n_episodes, n_steps):
     buffer = make_buffer("planner", n_episodes, n_steps)
-    assert plan_ratio(buffer) == 0.0
+    assert plan_ratio(buffer) is None
     assert settings(buffer)["chunk_size"] == 1
+    assert any("too few episodes" in sentence for sentence in sentences(decide(buffer)))
 
 
 def test_returns_that_hardly_differ_are_left_out():
@@ -69,6 +71,15 @@ def test_returns_that_hardly_differ_are_left_out():
 def test_few_steps_make_small_batches():
     assert settings(make_buffer("agent", 20, 40))["batch_size"] == 64
     assert settings(make_buffer("agent", 20, 500))["batch_size"] == 256
+
+
+def test_what_a_user_gives_counts_and_its_counterpart_is_not_decided():
+    """The mean action needs a regression, which plans would leave out."""
+    buffer = make_buffer("planner")
+    given = DTFM("MultiInputPolicy", dataset=buffer, batch_size=32, policy_kwargs={"n_solver_steps": 0}, device="cpu")
+    assert (given.batch_size, given.policy.acting_settings()["n_solver_steps"], given.policy.chunk_size) == (32, 0, 8)
+    decided = DTFM("MultiInputPolicy", dataset=buffer, device="cpu")
+    assert (decided.batch_size, decided.policy.acting_settings()["n_solver_steps"], decided.policy.chunk_size) == (64, 10, 8)
 
 
 def test_people_are_told_each_reason_once():

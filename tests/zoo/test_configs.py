@@ -83,6 +83,7 @@ def test_the_papers_settings():
         "tokens_per_step": 3,
         "timestep_embedding": True,
         "chunk_size": 1,
+        "return_conditioning": True,
         "return_scaling": "max",
         "clip_return_to_go": False,
         "film_return_to_go": False,
@@ -133,7 +134,9 @@ def test_a_search_can_find_the_packaged_settings(algo, settings):
     defaults.update(policy.head_class.options())
     for hyperparams in load(algo, settings).values():
         policy_kwargs = copy.copy(hyperparams.get("policy_kwargs", {}))
-        for key in {"solver", "one_step", "return_scaling", "regression_coef"} & set(policy_kwargs):  # not searched for
+        for key in {"solver", "one_step", "return_scaling", "return_conditioning", "regression_coef"} & set(
+            policy_kwargs
+        ):  # not searched for
             del policy_kwargs[key]
         packaged = {**defaults, "batch_size": 256, **hyperparams, **policy_kwargs}  # which the data decide by default
         powers = {f"{key}_pow": int(np.log2(value)) for key, value in packaged.items() if type(value) is int and value > 0}
