@@ -61,7 +61,7 @@ ACCEPTED: dict[str, Rule] = {
     "dataset_fraction": Number(low=0, high=1, above_low=True),
     "dataset_seed": Number(low=0, whole=True),
     "timestep_exponent": POSITIVE,
-    "return_weight": NOT_NEGATIVE,
+    "return_weight": NOT_NEGATIVE._replace(optional=True),
     "return_steps": Number(low=1, whole=True, optional=True),
     "max_grad_norm": NOT_NEGATIVE._replace(optional=True),
     "warmup_steps": Number(low=0, whole=True),
@@ -72,8 +72,8 @@ ACCEPTED: dict[str, Rule] = {
     "seed": Number(low=0, whole=True, optional=True),
     "target_return": Number(optional=True),
 }
-
-
+# Arguments of the algorithm that the data decide where they are None; the policy's are among `policy_kwargs`.
+DECIDED = {"batch_size", "return_weight"}
 # What acts, and by which loss the trunk learns.
 TRAINED_BY = {"n_solver_steps", "regression_coef"}
 
@@ -98,7 +98,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
     :param timestep_exponent: e of the time step T u^e at which windows end in an episode of T steps, for u uniform in
         [0, 1]: above 1 an episode's start, of which there is little in long episodes, is learned from more often
     :param return_weight: w: of mixed data, a step of the best episode is learned from 1 + w times as often as one of the
-        worst, and others by their returns in between (Yue et al., 2022); 0 learns from all alike
+        worst, and others by their returns in between (Yue et al., 2022); 0 learns from all alike. By default 5 where
+        returns tell how episodes act, and 0 elsewhere
     :param return_steps: n: a step's return-to-go is the rewards of n steps and what may be expected after such an
         observation, so that asking for the best does not ask for luck (Paster et al., 2022); None takes what was recorded
     :param dataset_kwargs: further arguments of :func:`~sb3_dtfm.data.load_dataset`: `{"cache_dir": folder}` for datasets
@@ -142,7 +143,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         dataset_fraction: float = 1.0,
         dataset_seed: int = 0,
         timestep_exponent: float = 1.0,
-        return_weight: float = 5.0,
+        return_weight: float | None = None,
         return_steps: int | None = None,
         dataset_kwargs: dict[str, Any] | None = None,
         max_grad_norm: float | None = None,
@@ -183,7 +184,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         self.dataset_fraction = dataset_fraction
         self.dataset_seed = dataset_seed
         self.timestep_exponent = timestep_exponent
-        self.return_weight = return_weight
+        self.return_weight: float = return_weight  # type: ignore[assignment]  # as batch_size
         self.return_steps = return_steps
         self.dataset_kwargs = dataset_kwargs
         self.max_grad_norm = max_grad_norm
@@ -222,12 +223,13 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         """Have the data decide of the policy's arguments what the user has left open; they are saved with the others."""
         given = self.policy_kwargs or {}
         names = self._policy_class.parameter_names() - set(given)
-        names |= {"batch_size"} if self.batch_size is None else set()
+        names |= {name for name in DECIDED if getattr(self, name) is None}
         if TRAINED_BY & set(given):  # which belong together
             names -= TRAINED_BY
         self.decisions = [each for each in decide(buffer) if each.name in names]
         values = {each.name: each.value for each in self.decisions}
-        self.batch_size = values.pop("batch_size", self.batch_size)
+        for name in DECIDED & set(values):
+            setattr(self, name, values.pop(name))
         self.policy_kwargs = {**values, **given}
 
     def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:

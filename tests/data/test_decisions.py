@@ -6,25 +6,27 @@ from gymnasium import spaces
 
 from sb3_dtfm import DTFM
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
-from sb3_dtfm.data.decisions import decide, plan_ratio, sentences
+from sb3_dtfm.data.decisions import decide, sentences
+from sb3_dtfm.data.predictability import prediction_errors
 
 SPACE = spaces.Box(-1.0, 1.0, (2,))
 
 
-def make_buffer(kind: str, n_episodes: int = 20, n_steps: int = 40, spread: float = 1.0) -> TrajectoryBuffer:
+def make_buffer(kind: str, n_episodes: int = 20, n_steps: int = 40) -> TrajectoryBuffer:
     """
-    Observations that jump about. An agent's action is a function of them; a planner's goes on as it began, whatever it sees.
-
-    :param spread: how far rewards differ between episodes
+    Observations that jump about, and rewards that differ between episodes. An agent's action is a function of what it sees;
+    of several agents ("ladder") the better ones act otherwise; a planner's goes on as it began, whatever it sees.
     """
     random = np.random.default_rng(0)
     episodes = []
     for number in range(n_episodes):
         observations = random.normal(size=(n_steps, 3)).astype(np.float32)
         answers = np.tanh(observations[:, :2]) + random.normal(0.0, 0.05, (n_steps, 2))
+        better = answers * (1.0 - 1.5 * number / n_episodes)
         plan = random.uniform(-0.8, 0.8, 2) + np.cumsum(random.normal(0.0, 0.02, (n_steps, 2)), axis=0)
-        actions = np.clip(answers if kind == "agent" else plan, -1.0, 1.0).astype(np.float32)
-        rewards = np.full(n_steps, 1.0 + spread * number / n_episodes)
+        acted = {"agent": answers, "ladder": better, "planner": plan}[kind]
+        actions = np.clip(acted, -1.0, 1.0).astype(np.float32)
+        rewards = np.full(n_steps, 1.0 + number / n_episodes)
         episodes.append(Trajectory(observations, actions, rewards, truncated=True))
     return TrajectoryBuffer.from_trajectories(episodes, SPACE)
 
@@ -35,14 +37,14 @@ def settings(buffer: TrajectoryBuffer) -> dict:
 
 def test_an_agents_actions_are_taken_one_by_one_and_at_their_mean():
     buffer = make_buffer("agent")
-    assert plan_ratio(buffer) < 0.2
+    assert prediction_errors(buffer).plan_ratio() < 0.2
     decided = settings(buffer)
     assert (decided["chunk_size"], decided["n_solver_steps"], decided["regression_coef"]) == (1, 0, 1.0)
 
 
 def test_a_planners_actions_are_drawn_in_chunks():
     buffer = make_buffer("planner")
-    assert plan_ratio(buffer) > 5.0
+    assert prediction_errors(buffer).plan_ratio() > 5.0
     decided = settings(buffer)
     assert (decided["chunk_size"], decided["n_solver_steps"], decided["regression_coef"]) == (8, 10, 0.0)
     assert decided["timestep_embedding"]
@@ -51,21 +53,29 @@ def test_a_planners_actions_are_drawn_in_chunks():
 def test_a_decision_repeats_and_leaves_the_data_alone():
     buffer = make_buffer("planner")
     before = buffer.actions.clone()
-    assert plan_ratio(buffer) == plan_ratio(buffer)
+    first, again = prediction_errors(buffer), prediction_errors(buffer)
+    assert all(np.array_equal(mine, its) for mine, its in zip(first, again, strict=True))
     assert buffer.actions.equal(before)
 
 
 @pytest.mark.parametrize(("n_episodes", "n_steps"), [(1, 40), (5, 1)], ids=["one episode", "episodes of one step"])
 def test_too_little_to_tell_is_taken_for_an_agents(n_episodes, n_steps):
     buffer = make_buffer("planner", n_episodes, n_steps)
-    assert plan_ratio(buffer) is None
+    assert prediction_errors(buffer) is None
     assert settings(buffer)["chunk_size"] == 1
     assert any("too few episodes" in sentence for sentence in sentences(decide(buffer)))
 
 
-def test_returns_that_hardly_differ_are_left_out():
-    assert settings(make_buffer("agent", spread=1.0))["return_conditioning"] is True
-    assert settings(make_buffer("agent", spread=0.05))["return_conditioning"] is False
+@pytest.mark.parametrize(("kind", "expected"), [("ladder", (True, 5.0)), ("agent", (False, 0.0))])
+def test_returns_count_where_they_tell_how_an_episode_acts(kind, expected):
+    decided = settings(make_buffer(kind))
+    assert (decided["return_conditioning"], decided["return_weight"]) == expected
+
+
+def test_returns_that_are_all_alike_tell_nothing():
+    buffer = make_buffer("ladder")
+    buffer.episodes.returns[:] = 1.0
+    assert prediction_errors(buffer).gain_by_return() == 0.0
 
 
 def test_few_steps_make_small_batches():
