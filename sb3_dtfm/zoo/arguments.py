@@ -103,7 +103,7 @@ def train_parser() -> argparse.ArgumentParser:
     offline(
         "--target-return",
         type=float,
-        help="return to ask for when acting, in reward units; by default that of the settings, or else what `inspect` suggests",
+        help="return to ask for when acting, in reward units; by default the settings' or, without one, the data decide",
     )
     offline(
         "-conf",

@@ -16,7 +16,7 @@ from sb3_dtfm.files import read_run
 
 # Below this share of the goal there is something to try.
 ENOUGH = 0.9
-# Fewer recorded episodes than this may be learned by heart.
+# Fewer recorded episodes than this may be overfitted.
 FEW_EPISODES = 50
 N_RANDOM_EPISODES = 5
 
@@ -96,8 +96,8 @@ def compare(
     """
     Compare a model's episodes with its target return and the recorded episodes, see :meth:`ReturnReference.goal`.
 
-    Where they reach less than nine tenths of the goal, things to try follow: longer training, or dropout for few episodes,
-    and a sweep where the model looks at a target return.
+    Where they reach less than nine tenths of the goal, things to try follow: longer training, dropout for few episodes, and
+    a sweep where the model looks at a target return.
 
     :param attributes: of the model, or of its file; `target_return` is that of these episodes
     :param returns: of its episodes, environment reward units
@@ -124,12 +124,10 @@ def compare(
             f"{_percent(reference.success_rate)} of the recorded episodes succeeded, {_percent(rate)} of these."
         )
     if share is not None and share < ENOUGH:
+        n_steps = attributes["_total_timesteps"]
+        sentences.append(f"Longer training may help: -n {2 * n_steps} instead of {n_steps}.")
         if reference.n_episodes < FEW_EPISODES and not policy_kwargs.get("dropout"):
-            few = f"The model may know {reference.n_episodes} episodes by heart"
-            sentences.append(f"{few}: -params dropout:0.1 makes that harder.")
-        else:
-            n_steps = attributes["_total_timesteps"]
-            sentences.append(f"Longer training may help: -n {2 * n_steps} instead of {n_steps}.")
+            sentences.append(f"Dropout may help to learn from {reference.n_episodes} episodes: -params dropout:0.1")
         if target is not None:
             dataset = read_run(run / env_name).get("dataset")
             arguments = f"--env {env_name.gym_id} --dataset {dataset if isinstance(dataset, str) else 'DATASET'}"
