@@ -43,8 +43,8 @@ FENCE = re.compile(rf"^( *)(?:{MARK}\1)?```([^\n]*)\n(.*?)^\1```$", re.MULTILINE
 SHELL = ("", "sh")
 # What the fast tests take instead.
 FEWER = {
-    "range(60)": "range(3)",
-    "learn(500)": "learn(2)",
+    "range(30)": "range(3)",
+    "learn(1_000)": "learn(2)",
     "n_eval_episodes=10": "n_eval_episodes=1",
     'make("MountainCarContinuous-v0")': 'make("MountainCarContinuous-v0", max_episode_steps=20)',
 }

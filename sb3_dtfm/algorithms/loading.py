@@ -14,7 +14,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule, get_device
 
 from sb3_dtfm.algorithms.saving import ENCODED, OPTIMIZER, POLICY, SPACES, UnsavedSchedule, head_name, optimizers
-from sb3_dtfm.arguments import COUNT, NOT_NEGATIVE, Number, Rule, check_arguments
+from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, Number, Rule, check_arguments
 from sb3_dtfm.data import ReturnReference, check_action_space
 from sb3_dtfm.envs import OBSERVATION, RETURN_TO_GO, TIMESTEP
 from sb3_dtfm.files import ModelFileError, file_name, read_model
@@ -39,8 +39,11 @@ COUNTERS: dict[str, Rule] = {
     "_n_left": WHOLE,
     "verbose": WHOLE,
 }
-# Of a ReturnReference, in its order.
-RETURN_REFERENCE = (Number(), Number(), COUNT, Number(low=0, high=1, optional=True), Number(optional=True))
+# Values of a ReturnReference, in its order.
+RETURN_REFERENCE: tuple[Rule, ...] = (
+    *(Number(), Number(), Number(), COUNT, BOOLEAN),
+    *(Number(low=0, high=1, optional=True), Number(optional=True)),
+)
 # Of the policy's tensors.
 POSITIVE_BUFFERS = {
     "normalization.observation_std",
@@ -197,9 +200,10 @@ def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
     kinds = [type(each) for each in reference] if isinstance(reference, list) else reference
     if kinds not in (None, [float, float, str]) or (reference and not reference[0] < reference[1]):
         raise ModelFileError(f"{source}: score_reference is {reference}, expected two returns and where they come from.")
-    returns = attributes.get("return_reference")
+    returns: Any = attributes.get("return_reference")
     known = isinstance(returns, list) and len(returns) == len(RETURN_REFERENCE)
-    if returns is not None and not (known and all(map(Number.accepts, RETURN_REFERENCE, returns))):
+    accepted = known and all(rule.accepts(value) for rule, value in zip(RETURN_REFERENCE, returns, strict=True))
+    if returns is not None and not accepted:
         raise ModelFileError(f"{source}: return_reference is {returns}, expected {', '.join(ReturnReference._fields)}.")
     with naming_the_file(source):
         check_arguments({**dict.fromkeys(COUNTERS, 1), **attributes}, COUNTERS)  # one may have been left out

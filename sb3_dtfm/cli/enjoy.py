@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from sb3_dtfm.zoo import commands
-from sb3_dtfm.zoo.arguments import enjoy_arguments
+from sb3_dtfm.zoo.arguments import enjoy_arguments, enjoy_parser
 from sb3_dtfm.zoo.registration import register
 
 
@@ -14,4 +14,8 @@ def main(argv: Sequence[str]) -> None:
     :param argv: its arguments
     """
     register()
-    commands.enjoy(enjoy_arguments(argv))
+    if {"-h", "--help"} & set(argv):
+        enjoy_parser().print_help()
+        commands.enjoy(["--help"])
+    target_return, arguments = enjoy_arguments(argv)
+    commands.enjoy(arguments, target_return)

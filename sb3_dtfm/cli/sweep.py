@@ -258,7 +258,7 @@ def chance(returns: np.ndarray) -> float:
 
 def draw(curves: dict[str, list[Asked]], recorded: np.ndarray, output: Path, title: str) -> Path:
     """
-    Draw what was reached against what was asked for, above the returns of the recorded episodes.
+    Draw reached returns over target returns, above the returns of the recorded episodes.
 
     :param curves: as for :func:`table`
     :param recorded: (E,) returns of the dataset's episodes
@@ -271,7 +271,7 @@ def draw(curves: dict[str, list[Asked]], recorded: np.ndarray, output: Path, tit
     figure = Figure(figsize=(6.4, 5.4), layout="constrained")
     axis, below = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
     targets = np.array([asked.target for asked in next(iter(curves.values()))])
-    axis.plot(targets, targets, color="0.6", linestyle="--", linewidth=1.2, label="what was asked for")
+    axis.plot(targets, targets, color="0.6", linestyle="--", linewidth=1.2, label="target return")
     for (name, reached), color in zip(curves.items(), COLORS * len(curves), strict=False):
         estimate, low, high = np.array([asked.interval for asked in reached]).T
         axis.plot(targets, estimate, color=color, marker="o", markersize=4, linewidth=1.8, label=name)

@@ -80,21 +80,25 @@ def suggested_target_return(buffer: TrajectoryBuffer) -> float:
     :param buffer: as it would be learned from
     :return: environment reward units, four digits
     """
-    decided = explained_by_start(buffer) >= START_DECIDES
-    chosen = buffer if decided else buffer.best(best_share=BEST_SHARE)
-    return float(f"{chosen.episode_returns.mean():.4g}")
+    return float(f"{return_reference(buffer).suggested:.4g}")
 
 
 def return_reference(buffer: TrajectoryBuffer) -> ReturnReference:
     """
-    What the returns of a model are compared with.
+    Recorded returns, which the returns of a model are compared with.
 
     :param buffer: as it is learned from
     :return: without the return of random actions, which only an environment tells
     """
-    best, rate = buffer.best(best_share=BEST_SHARE).episode_returns.mean(), buffer.successes.mean()
-    success_rate = None if np.isnan(rate) else float(rate)
-    return ReturnReference(float(buffer.episode_returns.mean()), float(best), buffer.n_episodes, success_rate)
+    returns, rate = buffer.episode_returns, float(buffer.successes.mean())
+    return ReturnReference(
+        recorded=float(returns.mean()),
+        best_tenth=float(buffer.best(best_share=BEST_SHARE).episode_returns.mean()),
+        best=float(returns.max()),
+        n_episodes=buffer.n_episodes,
+        start_decides=explained_by_start(buffer) >= START_DECIDES,
+        success_rate=None if np.isnan(rate) else rate,
+    )
 
 
 def explained_by_start(buffer: TrajectoryBuffer) -> float:

@@ -1,6 +1,7 @@
 """One recorded episode: what it holds, what makes it unfit for learning, and the return-to-go of its steps."""
 
 import contextlib
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -132,31 +133,62 @@ class ScoreReference(NamedTuple):
 
 class ReturnReference(NamedTuple):
     """
-    What the episodes of a model are compared with.
+    Recorded returns, which the returns of a model are compared with.
 
     :param recorded: mean return of the recorded episodes, environment reward units
     :param best_tenth: mean return of the best tenth of them, environment reward units
+    :param best: largest return of them, environment reward units
     :param n_episodes: number of recorded episodes
-    :param success_rate: share of them that succeeded, in [0, 1]; None where the data do not tell
+    :param start_decides: the first observation explains at least half of the returns' variance
+    :param success_rate: share of the recorded episodes that succeeded, in [0, 1]; None where the data do not tell
     :param random: mean return of random actions, environment reward units; None where it was not measured
     """
 
     recorded: float
     best_tenth: float
+    best: float
     n_episodes: int
+    start_decides: bool = False
     success_rate: float | None = None
     random: float | None = None
 
-    def share(self, episode_return: float) -> float | None:
+    @property
+    def suggested(self) -> float:
+        """The target return that the data suggest: the best tenth's, or the mean where these had the luckiest starts."""
+        return self.recorded if self.start_decides else self.best_tenth
+
+    def goal(self, target_return: float | None) -> tuple[float, str]:
         """
-        How far a return is on the way from random actions to what was recorded.
+        The return that a model has to reach, and its name.
+
+        A model has to reach its target return. A target beyond every recorded return means the best of the data: then the
+        goal is the best tenth. A target above the mean means luck where the start decides: then the goal is the mean. The
+        mean is also the goal of a model without a target return, which copies all episodes.
+
+        :param target_return: environment reward units; None where the model has none, or does not look at it
+        """
+        if target_return is None or (self.start_decides and _exceeds(target_return, self.recorded)):
+            return self.recorded, "the recorded mean"
+        if _exceeds(target_return, self.best):
+            return self.best_tenth, "the best tenth"
+        return target_return, "the target return"
+
+    def share(self, episode_return: float, goal: float) -> float | None:
+        """
+        The part that a return is of the way from random actions to a goal, which also makes sense of negative returns.
 
         :param episode_return: environment reward units
-        :return: 0 for random actions, 1 for the recorded mean; None where random actions are not known to be worse
+        :param goal: environment reward units
+        :return: 0 for random actions, 1 for the goal; None where random actions are not known to be worse than the goal
         """
-        if self.random is None or self.recorded <= self.random:
+        if self.random is None or goal <= self.random:
             return None
-        return (episode_return - self.random) / (self.recorded - self.random)
+        return (episode_return - self.random) / (goal - self.random)
+
+
+def _exceeds(target_return: float, recorded: float) -> bool:
+    """Whether a target is above a recorded return by more than the rounding of suggested targets to four digits."""
+    return target_return > recorded and not math.isclose(target_return, recorded, rel_tol=1e-3)
 
 
 def returns_to_go(rewards: np.ndarray) -> np.ndarray:

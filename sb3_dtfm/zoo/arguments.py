@@ -27,17 +27,25 @@ class UsageError(ValueError):
     """Arguments that do not go together; the message says which would."""
 
 
-def asking_for(target_return: float, env_wrapper: Any) -> list[Any]:
+def asking_for(target_return: float | None, env_wrapper: Any) -> list[dict[Any, dict[str, Any]]]:
     """
-    :param target_return: that the environment is to ask for
-    :param env_wrapper: RL-Zoo's setting: a wrapper's path, one with its arguments, or a list of these
-    :return: the same wrappers, of which a ReturnToGoWrapper asks for it
+    Wrappers of an environment with the target return that it asks for.
+
+    :param target_return: environment reward units; None leaves it as it is
+    :param env_wrapper: RL-Zoo's setting: a wrapper, its path, one of these with its arguments, a list of these, or None
+    :return: the same wrappers with their arguments; a ReturnToGoWrapper follows where there was none
     """
-    wrappers = env_wrapper if isinstance(env_wrapper, list) else [env_wrapper]
-    named = [each if isinstance(each, dict) else {each: None} for each in wrappers]
-    own = [each for each in named if next(iter(each)).endswith(".ReturnToGoWrapper")] or [{WRAPPER: None}]
-    asking = {path: {**(arguments or {}), "target_return": target_return} for path, arguments in own[0].items()}
-    return [asking if each is own[0] else each for each in named] if own[0] in named else [*named, asking]
+    given = env_wrapper if isinstance(env_wrapper, list) else [env_wrapper] if env_wrapper else []
+    pairs = [next(iter(each.items())) if isinstance(each, dict) else (each, None) for each in given]
+    if not any(map(_shows_return_to_go, (wrapper for wrapper, _ in pairs))):
+        pairs.append((WRAPPER, None))
+    target = {} if target_return is None else {"target_return": target_return}
+    return [{wrapper: {**(kwargs or {}), **(target if _shows_return_to_go(wrapper) else {})}} for wrapper, kwargs in pairs]
+
+
+def _shows_return_to_go(wrapper: str | type) -> bool:
+    name = wrapper if isinstance(wrapper, str) else wrapper.__qualname__
+    return name.rpartition(".")[2] == WRAPPER.rpartition(".")[2]
 
 
 def key_values(option: str, texts: Sequence[str]) -> dict[str, Any]:
@@ -92,7 +100,11 @@ def train_parser() -> argparse.ArgumentParser:
     )
     offline("--dataset-fraction", type=float, help="randomly drawn share of the episodes, in (0, 1]")
     offline("--dataset-cache", metavar="DIR", help="learn from memory-mapped files made in this folder")
-    offline("--target-return", type=float, help="return to ask for when acting, in reward units")
+    offline(
+        "--target-return",
+        type=float,
+        help="return to ask for when acting, in reward units; by default the settings' or, without one, the data decide",
+    )
     offline(
         "-conf",
         "--conf-file",
@@ -176,17 +188,12 @@ def train_arguments(argv: Sequence[str]) -> list[str]:
 
 def _check_task(conf_file: str, env_id: str, hyperparams: Sequence[str]) -> None:
     """
-    Say what a task that the packaged settings do not list still needs.
-
-    :raises UsageError: no dataset or no target return
+    :raises UsageError: no dataset for a task that the packaged settings do not list
     """
-    if env_id in yaml.safe_load(Path(conf_file).read_text()):
-        return
     given = {hyperparam.split(":")[0] for hyperparam in hyperparams}
-    needed = {"dataset": "--dataset", "env_wrapper": "--target-return"}
-    missing = [option for key, option in needed.items() if key not in given]
-    if missing and env_id in gym.registry:
-        raise UsageError(f"{', '.join(missing)}: needed for {env_id}, which {conf_file} does not list.")
+    listed = yaml.safe_load(Path(conf_file).read_text())
+    if "dataset" not in given and env_id in gym.registry and env_id not in listed:
+        raise UsageError(f"--dataset: needed for {env_id}, which {conf_file} does not list.")
 
 
 def _wrappers(conf_file: str | None, env_id: str) -> Any:
@@ -211,16 +218,35 @@ def _shorthands(options: argparse.Namespace, given: dict[str, Any], wrappers: An
     return [(option, f"{key}:{value!r}") for option, key, wanted, value in candidates if wanted is not None]
 
 
-def enjoy_arguments(argv: Sequence[str]) -> list[str]:
+def enjoy_parser() -> argparse.ArgumentParser:
+    """Arguments of `enjoy` that RL-Zoo does not have, or that get a default here."""
+    parser = argparse.ArgumentParser(
+        prog="sb3-dtfm enjoy",
+        add_help=False,
+        usage="sb3-dtfm enjoy --algo dtfm --env ENV [options] [RL-Zoo options]",
+        description="Act with a trained model, and compare its episodes with the recorded ones.",
+        epilog="RL-Zoo's own options follow.\n",
+    )
+    offline = parser.add_argument_group(f"of {' and '.join(ALGORITHMS)}").add_argument
+    offline("--target-return", type=float, help="return to ask for, in reward units; the run's by default")
+    shared = parser.add_argument_group("read on the way to RL-Zoo").add_argument
+    shared("--algo", default="ppo", help=argparse.SUPPRESS)
+    shared("-f", "--folder", help=argparse.SUPPRESS)
+    return parser
+
+
+def enjoy_arguments(argv: Sequence[str]) -> tuple[float | None, list[str]]:
     """
-    Arguments for RL-Zoo's `enjoy`: ours are looked for where `train` puts them, not among the Zoo's own agents.
+    The target return that is given, None without, and arguments for RL-Zoo's `enjoy`.
+
+    Our models are looked for where `train` puts them, not among the Zoo's own agents.
 
     :param argv: the user's arguments
+    :raises UsageError: a target return for an algorithm that asks for none
     """
-    parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument("--algo")
-    parser.add_argument("-f", "--folder")
-    options, _ = parser.parse_known_args(argv)
-    if options.algo in (*ALGORITHMS, STEERED) and options.folder is None:
-        return [*argv, "--folder", "logs"]
-    return list(argv)
+    options, rest = enjoy_parser().parse_known_args(argv)
+    ours = options.algo in (*ALGORITHMS, STEERED)
+    if options.target_return is not None and not ours:
+        raise UsageError(f"--target-return: for --algo {' and '.join(ALGORITHMS)} only, not for {options.algo}.")
+    folder = options.folder or ("logs" if ours else None)
+    return options.target_return, ["--algo", options.algo, *rest, *(["--folder", folder] if folder else [])]

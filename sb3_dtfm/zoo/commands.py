@@ -76,11 +76,12 @@ def finetune(
     _call(rl_zoo3.train.train, "finetune", arguments)
 
 
-def enjoy(arguments: Sequence[str]) -> None:
+def enjoy(arguments: Sequence[str], target_return: float | None = None) -> None:
     """
     Act with a trained model, and compare its episodes with those that it learned from.
 
     :param arguments: of RL-Zoo's `enjoy`
+    :param target_return: to ask for, environment reward units; None as in the model's run
     :raises FileNotFoundError: no such run, or no such model in it
     """
     found: list[tuple[FoundModel, EnvironmentName]] = []
@@ -92,6 +93,8 @@ def enjoy(arguments: Sequence[str]) -> None:
 
     def make(*args: Any, **kwargs: Any) -> EpisodesOf:
         envs.append(EpisodesOf(create_test_env(*args, **kwargs)))
+        if target_return is not None:
+            envs[-1].env_method("set_target_return", target_return)
         return envs[-1]
 
     rl_zoo3.enjoy.get_model_path = find  # type: ignore[assignment]
@@ -99,7 +102,7 @@ def enjoy(arguments: Sequence[str]) -> None:
     _call(rl_zoo3.enjoy.enjoy, "enjoy", arguments)
     model, env_name = found[-1]
     if not holds_pickles(model.path):  # those of RL-Zoo's own algorithms
-        attributes = read_configuration(model.path)["attributes"]
+        attributes = {**read_configuration(model.path)["attributes"], "target_return": envs[-1].get_attr("target_return")[0]}
         for sentence in compare(attributes, envs[-1].returns, envs[-1].successes, Path(model.run), env_name):
             print(sentence)
 

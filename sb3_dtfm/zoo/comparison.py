@@ -1,4 +1,4 @@
-"""A model's episodes beside those that it learned from, which `train` and `enjoy` compare in the end."""
+"""The returns of a model beside its target return and the recorded returns, as `train` and `enjoy` end by printing."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,9 +14,9 @@ from sb3_dtfm.data import ReturnReference
 from sb3_dtfm.envs.success import reported_success
 from sb3_dtfm.files import read_run
 
-# Below this share of what was recorded there is something to try.
+# Below this share of the goal there is something to try.
 ENOUGH = 0.9
-# Fewer recorded episodes than this may be learned by heart.
+# Fewer recorded episodes than this may be overfitted.
 FEW_EPISODES = 50
 N_RANDOM_EPISODES = 5
 
@@ -94,10 +94,12 @@ def compare(
     attributes: Mapping[str, Any], returns: Sequence[float], successes: Sequence[bool], run: Path, env_name: EnvironmentName
 ) -> list[str]:
     """
-    Compare a model's episodes with those that it learned from, and name two things to try where they reach less than nine
-    tenths of these. Success decides that where both tell of it.
+    Compare a model's episodes with its target return and the recorded episodes, see :meth:`ReturnReference.goal`.
 
-    :param attributes: of the model, or of its file
+    Where they reach less than nine tenths of the goal, things to try follow: longer training, dropout for few episodes, and
+    a sweep where the model looks at a target return.
+
+    :param attributes: of the model, or of its file; `target_return` is that of these episodes
     :param returns: of its episodes, environment reward units
     :param successes: whether they succeeded; none where the task does not tell
     :param run: folder of its run
@@ -107,36 +109,30 @@ def compare(
     if attributes.get("return_reference") is None or not len(returns):
         return []
     reference = ReturnReference(*attributes["return_reference"])
+    policy_kwargs = attributes.get("policy_kwargs") or {}
+    target = attributes.get("target_return") if policy_kwargs.get("return_conditioning", True) else None
     reached = float(np.mean(returns))
-    share = reference.share(reached)
-    random = "" if reference.random is None else f"random {four_digits(reference.random)}, "
-    recorded = f"{four_digits(reference.recorded)} (best tenth {four_digits(reference.best_tenth)})"
-    of_it = "" if share is None else f": {_percent(share)} of what was recorded"
-    sentences = [f"Recorded {recorded}, {random}reached {four_digits(reached)}{of_it}."]
+    goal, name = reference.goal(target)
+    share = reference.share(reached, goal)
+    recorded = f"Recorded {four_digits(reference.recorded)} (best tenth {four_digits(reference.best_tenth)})"
+    others = {"random": reference.random, "target return": target, "reached": reached}
+    numbers = ", ".join([recorded, *(f"{key} {four_digits(value)}" for key, value in others.items() if value is not None)])
+    sentences = [f"{numbers}." if share is None else f"{numbers}: {_percent(share)} of {name}."]
     if reference.success_rate and len(successes):
         rate = float(np.mean(successes))
-        share = rate / reference.success_rate
         sentences.append(
             f"{_percent(reference.success_rate)} of the recorded episodes succeeded, {_percent(rate)} of these."
         )
     if share is not None and share < ENOUGH:
-        sentences += _to_try(attributes, reference, run, env_name)
+        n_steps = attributes["_total_timesteps"]
+        sentences.append(f"Longer training may help: -n {2 * n_steps} instead of {n_steps}.")
+        if reference.n_episodes < FEW_EPISODES and not policy_kwargs.get("dropout"):
+            sentences.append(f"Dropout may help to learn from {reference.n_episodes} episodes: -params dropout:0.1")
+        if target is not None:
+            dataset = read_run(run / env_name).get("dataset")
+            arguments = f"--env {env_name.gym_id} --dataset {dataset if isinstance(dataset, str) else 'DATASET'}"
+            sentences.append(f"A sweep shows the best target return: sb3-dtfm sweep {run} {arguments}")
     return sentences
-
-
-def _to_try(attributes: Mapping[str, Any], reference: ReturnReference, run: Path, env_name: EnvironmentName) -> list[str]:
-    """Two commands, or options of `train`."""
-    n_steps = attributes["_total_timesteps"]
-    dropout = (attributes.get("policy_kwargs") or {}).get("dropout")
-    if reference.n_episodes < FEW_EPISODES and dropout == 0:
-        first = (
-            f"Learning {reference.n_episodes} episodes by heart may be what hinders: -params dropout:0.1 makes that harder."
-        )
-    else:
-        first = f"Longer training may help: -n {2 * n_steps} instead of {n_steps}."
-    dataset = read_run(run / env_name).get("dataset")
-    name = dataset if isinstance(dataset, str) else "DATASET"
-    return [first, f"Which return is best to ask for: sb3-dtfm sweep {run} --env {env_name.gym_id} --dataset {name}"]
 
 
 def four_digits(number: float) -> str:

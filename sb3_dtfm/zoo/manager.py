@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import optuna
+import yaml
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -22,7 +23,7 @@ from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.arguments import with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.distributed import is_first_process
-from sb3_dtfm.zoo.arguments import UsageError
+from sb3_dtfm.zoo.arguments import UsageError, asking_for
 from sb3_dtfm.zoo.comparison import MeasureRandomActions, compare
 from sb3_dtfm.zoo.registration import with_policy_options
 from sb3_dtfm.zoo.resuming import CHECKPOINT, KeepCheckpoint, ReplaceEvaluations, Start, StopSignals, go_on
@@ -40,6 +41,7 @@ class OfflineExperimentManager(ExperimentManager):
     RL-Zoo's own manager, for all of its algorithms, and what offline learning needs beside it.
 
     - A run that ends before it has a model leaves no folder, where `enjoy` would look for the latest run.
+    - An environment of dt or dtfm always shows a return-to-go, and the run's settings say which target return it asks for.
     - dt and dtfm are evaluated before the first gradient step and after the last one too.
     - Of the processes of one training, the first alone runs callbacks.
     - They keep a checkpoint while they train, and a run goes on from it.
@@ -69,17 +71,27 @@ class OfflineExperimentManager(ExperimentManager):
             self.trained_agent, self.continue_training = str(resumed / CHECKPOINT), True
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """RL-Zoo's; options of the policy may stand beside the algorithm's."""
+        """RL-Zoo's; options of the policy may stand beside the algorithm's, and the ReturnToGoWrapper may be left out."""
         hyperparams, saved = super().read_hyperparameters()
         if self.algo not in ALGORITHMS:
             return hyperparams, saved
         hyperparams = with_policy_options(hyperparams)
+        if self.learns_offline:
+            hyperparams = {**hyperparams, "env_wrapper": asking_for(None, hyperparams.get("env_wrapper"))}
         return hyperparams, OrderedDict(sorted(hyperparams.items()))
+
+    @property
+    def learns_offline(self) -> bool:
+        """Whether a timestep is a gradient step on recorded episodes."""
+        return self.algo in ALGORITHMS and self.command == "train"
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """RL-Zoo's, which makes the run's folder before its model."""
         try:
-            return super().setup_experiment()
+            made = super().setup_experiment()
+            if made is not None and self.learns_offline:
+                self._save_target_return(*made)
+            return made
         except BaseException as error:
             with contextlib.suppress(OSError):  # not made yet, or no longer empty: then it is a run's
                 os.rmdir(self.params_path)
@@ -88,6 +100,17 @@ class OfflineExperimentManager(ExperimentManager):
             if isinstance(error, TypeError):
                 self._check_names(error)
             raise
+
+    def _save_target_return(self, model: BaseAlgorithm, saved: dict[str, Any]) -> None:
+        """
+        Write into the run's settings which target return its environment got from the data, for whoever acts with the model.
+
+        :param model: with its environment
+        :param saved: the settings
+        """
+        assert model.env is not None
+        saved["env_wrapper"] = asking_for(model.env.get_attr("target_return")[0], saved["env_wrapper"])
+        Path(self.params_path, "config.yml").write_text(yaml.dump(saved))
 
     def _check_names(self, error: TypeError) -> None:
         """
@@ -126,8 +149,8 @@ class OfflineExperimentManager(ExperimentManager):
         if not is_first_process():
             self.callbacks = []
             return
-        n_envs, counts_gradient_steps = self.n_envs, self.algo in ALGORITHMS and self.command == "train"
-        self.n_envs = 1 if counts_gradient_steps else n_envs  # by which RL-Zoo divides the intervals
+        n_envs = self.n_envs
+        self.n_envs = 1 if self.learns_offline else n_envs  # by which RL-Zoo divides the intervals
         super().create_callbacks()
         self.n_envs = n_envs
         if self.algo not in ALGORITHMS or self.optimize_hyperparameters:
@@ -190,7 +213,8 @@ class OfflineExperimentManager(ExperimentManager):
             self.keeper.release()
         for evaluation in self.evaluations[-1:] if ended and self.verbose > 0 else []:
             reached = [evaluation.last_mean_reward], evaluation._is_success_buffer
-            for sentence in compare(vars(model), *reached, Path(self.save_path), self.env_name):
+            attributes = {**vars(model), "target_return": evaluation.eval_env.get_attr("target_return")[0]}
+            for sentence in compare(attributes, *reached, Path(self.save_path), self.env_name):
                 print(sentence)
         if self.signals.terminated and not ended:
             raise SystemExit(128 + signal.SIGTERM)

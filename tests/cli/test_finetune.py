@@ -33,10 +33,10 @@ def run(workplace):
     [
         ([], [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 9.0}}]),
         (["my.Repeat", {"a.ReturnToGoWrapper": {"target_return": 5}}, {"my.Scale": {"by": 2}}],
-         [{"my.Repeat": None}, {"a.ReturnToGoWrapper": {"target_return": 9.0}}, {"my.Scale": {"by": 2}}]),
+         [{"my.Repeat": {}}, {"a.ReturnToGoWrapper": {"target_return": 9.0}}, {"my.Scale": {"by": 2}}]),
         ([{"my.Scale": {"by": 2}}, {"my.Scale": {"by": 3}}],
          [{"my.Scale": {"by": 2}}, {"my.Scale": {"by": 3}}, {"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 9.0}}]),
-        ("my.Repeat", [{"my.Repeat": None}, {"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 9.0}}]),
+        ("my.Repeat", [{"my.Repeat": {}}, {"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 9.0}}]),
     ],
 )  # fmt: skip
 def test_another_target_leaves_the_other_wrappers(before, after):

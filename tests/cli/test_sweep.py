@@ -104,7 +104,7 @@ def test_the_table_and_the_picture_say_what_was_reached(tmp_path, monkeypatch):
     asked, *models = drawn[0].axes[0].lines
     assert asked.get_ydata().tolist() == [1, 5]
     assert [line.get_ydata().tolist() for line in models] == [[2, 4], [1, 5]]
-    assert [text.get_text() for text in drawn[0].axes[0].get_legend().get_texts()] == ["what was asked for", "DT", "DTFM"]
+    assert [text.get_text() for text in drawn[0].axes[0].get_legend().get_texts()] == ["target return", "DT", "DTFM"]
 
 
 def asked(effect: float, n_episodes: int = 10, seed: int = 0, successes=None) -> list[Asked]:

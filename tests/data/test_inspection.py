@@ -67,12 +67,33 @@ def test_episodes_that_are_there_twice_foretell_nothing_of_each_other():
 
 def test_the_return_reference_is_what_was_recorded():
     buffer = buffer_of(angles(20), np.arange(20.0))
-    assert return_reference(buffer) == ReturnReference(9.5, 18.5, 20)
+    assert return_reference(buffer) == ReturnReference(9.5, 18.5, 19.0, 20)
     told = buffer_of(angles(20), np.arange(20.0), success=np.arange(60) % 12 == 2)
-    assert return_reference(told) == ReturnReference(9.5, 18.5, 20, success_rate=0.25)
+    assert return_reference(told) == ReturnReference(9.5, 18.5, 19.0, 20, success_rate=0.25)
+    assert return_reference(buffer_of(angles(20), angles(20)[:, 0])).start_decides
 
 
 def test_a_share_is_counted_from_random_actions():
-    assert ReturnReference(110.0, 120.0, 9, random=10.0).share(60.0) == 0.5
-    assert ReturnReference(110.0, 120.0, 9).share(60.0) is None
-    assert ReturnReference(110.0, 120.0, 9, random=110.0).share(60.0) is None
+    reference = ReturnReference(110.0, 120.0, 130.0, 9, random=10.0)
+    assert reference.share(60.0, 110.0) == 0.5
+    assert reference._replace(random=-1200.0).share(-700.0, -200.0) == 0.5, "negative returns"
+    assert reference._replace(random=None).share(60.0, 110.0) is None
+    assert reference.share(60.0, 10.0) is None, "random actions reach the goal"
+
+
+@pytest.mark.parametrize(
+    ("target", "start_decides", "goal"),
+    [
+        (None, False, (110.0, "the recorded mean")),
+        (50.0, False, (50.0, "the target return")),
+        (125.0, False, (125.0, "the target return")),
+        (130.02, False, (130.02, "the target return")),  # a rounded one
+        (20000.0, False, (120.0, "the best tenth")),
+        (50.0, True, (50.0, "the target return")),
+        (110.0, True, (110.0, "the target return")),
+        (120.0, True, (110.0, "the recorded mean")),
+        (20000.0, True, (110.0, "the recorded mean")),
+    ],
+)
+def test_the_goal_is_the_target_return_as_far_as_the_data_go(target, start_decides, goal):
+    assert ReturnReference(110.0, 120.0, 130.0, 9, start_decides).goal(target) == goal
