@@ -27,17 +27,35 @@ class UsageError(ValueError):
     """Arguments that do not go together; the message says which would."""
 
 
-def asking_for(target_return: float, env_wrapper: Any) -> list[Any]:
+def asking_for(target_return: float | None, env_wrapper: Any) -> list[Any]:
     """
-    :param target_return: that the environment is to ask for
+    :param target_return: that the environment is to ask for, None for none
     :param env_wrapper: RL-Zoo's setting: a wrapper's path, one with its arguments, or a list of these
     :return: the same wrappers, of which a ReturnToGoWrapper asks for it
     """
-    wrappers = env_wrapper if isinstance(env_wrapper, list) else [env_wrapper]
-    named = [each if isinstance(each, dict) else {each: None} for each in wrappers]
-    own = [each for each in named if next(iter(each)).endswith(".ReturnToGoWrapper")] or [{WRAPPER: None}]
+    named = _with_arguments(env_wrapper)
+    own = [each for each in named if _is_return_to_go(each)] or [{WRAPPER: None}]
     asking = {path: {**(arguments or {}), "target_return": target_return} for path, arguments in own[0].items()}
     return [asking if each is own[0] else each for each in named] if own[0] in named else [*named, asking]
+
+
+def asked_for(env_wrapper: Any) -> float | None:
+    """
+    :param env_wrapper: as in :func:`asking_for`, None for no wrapper
+    :return: the target return of its ReturnToGoWrapper, None where there is none
+    """
+    arguments = [next(iter(each.values())) or {} for each in _with_arguments(env_wrapper or []) if _is_return_to_go(each)]
+    return arguments[0].get("target_return") if arguments else None
+
+
+def _with_arguments(env_wrapper: Any) -> list[dict[str, Any]]:
+    """Each wrapper's path with its arguments, None for none."""
+    wrappers = env_wrapper if isinstance(env_wrapper, list) else [env_wrapper]
+    return [each if isinstance(each, dict) else {each: None} for each in wrappers]
+
+
+def _is_return_to_go(wrapper: dict[str, Any]) -> bool:
+    return next(iter(wrapper)).endswith(".ReturnToGoWrapper")
 
 
 def key_values(option: str, texts: Sequence[str]) -> dict[str, Any]:
@@ -59,11 +77,12 @@ def key_values(option: str, texts: Sequence[str]) -> dict[str, Any]:
     return values
 
 
-def import_packages(modules: Sequence[str]) -> None:
+def import_packages(modules: Sequence[str], where: str = "--gym-packages") -> None:
     """
     Import what registers tasks, as RL-Zoo's `--gym-packages` does; gymnasium-robotics needs no mention.
 
     :param modules: dotted names
+    :param where: they were named, for the message
     :raises UsageError: there is none of that name
     """
     register_gymnasium_robotics()
@@ -71,7 +90,7 @@ def import_packages(modules: Sequence[str]) -> None:
         try:
             importlib.import_module(module)
         except ModuleNotFoundError as error:
-            raise UsageError(f"--gym-packages {module}: {error}.") from error
+            raise UsageError(f"{where} {module}: {error}.") from error
 
 
 def train_parser() -> argparse.ArgumentParser:
