@@ -174,26 +174,27 @@ def plot_scores(group: Group, output: Path) -> Path | None:
         return None
     means = [interval.estimate for *_, interval in drawn]
     low, high = max(SCORES_SHOWN[0], min(0.0, *means)), min(SCORES_SHOWN[1], max(1.0, *means))
-    with mpl.rc_context(
-        {"font.size": 11, "axes.spines.top": False, "axes.spines.left": False, "axes.spines.right": False}
-    ):
+    with mpl.rc_context({"font.size": 11, "axes.spines.top": False, "axes.spines.left": False, "axes.spines.right": False}):
         figure = Figure(figsize=(2 * PANEL[0], SCORE_ROW * len(data_sets) + 1.2), layout="constrained")
         FigureCanvasAgg(figure)
         axis = figure.subplots()
         for row in range(0, len(data_sets), 2):
             axis.axhspan(row - 0.5, row + 0.5, color="0.95", linewidth=0)
         axis.axvline(0.0, color="0.75", linewidth=0.8)
-        axis.axvline(1.0, color=AGENT_COLOR, linestyle="--", linewidth=1.2, label="best tenth of what was recorded")
         for row, algo, interval in drawn:
             color, marker = styles[algo]
             y = row + 0.8 * ((algos.index(algo) + 0.5) / len(algos) - 0.5)
-            axis.hlines(y, interval.low, interval.high, color=color, linewidth=1.6)
+            axis.hlines(y, interval.low, interval.high, color=color, linewidth=1.4, alpha=0.5)
             x = np.clip(interval.estimate, low, high)
-            axis.plot(x, y, marker, color=color, markersize=5.5, clip_on=False, linestyle="", label=full_name(algo))
+            style: dict[str, Any] = dict(
+                color=color, marker=marker, markersize=6.5, markeredgecolor="white", markeredgewidth=0.5
+            )
+            axis.plot(x, y, linestyle="", clip_on=False, zorder=3, label=full_name(algo), **style)
+        axis.axvline(1.0, color=AGENT_COLOR, linestyle="--", linewidth=1.2, label="best tenth of the recordings")
         axis.set(xlim=(low - 0.03, high + 0.03), xlabel="score", ylim=(len(data_sets) - 0.5, -0.5))
         axis.set_yticks(range(len(data_sets)), [name for name, *_ in data_sets])
         axis.tick_params(axis="y", length=0)
-        _save(figure, [axis], output, n_columns=len(algos) + 1 if len(algos) <= 4 else 4)
+        _save(figure, [axis], output, ncols=min(len(algos) + 1, 5), columnspacing=1.3, handletextpad=0.4, handlelength=1.5)
     return output
 
 
@@ -217,13 +218,13 @@ def _figure(group: Group, tasks: Sequence[str], output: Path, x_label: str) -> I
         for axis in axes[-1]:
             axis.set_xlabel(x_label)
         yield axes
-        _save(figure, axes.flat, output, n_columns=3 if width > 6.0 else 2)
+        _save(figure, axes.flat, output, ncols=3 if width > 6.0 else 2)
 
 
-def _save(figure: "Figure", axes: Iterable["Axes"], output: Path, n_columns: int) -> None:
+def _save(figure: "Figure", axes: Iterable["Axes"], output: Path, **legend: Any) -> None:
     """With one legend of all that is drawn."""
     handles = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=n_columns, frameon=False)
+    figure.legend(handles.values(), handles.keys(), loc="outside upper center", frameon=False, **legend)
     figure.align_ylabels()
     output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(output, dpi=150)

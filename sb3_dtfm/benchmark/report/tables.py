@@ -41,12 +41,12 @@ SOLVED_CAPTION = (
 )
 SCORES_CAPTION = (
     "Scores of the final evaluation: 0 is the mean return of random actions, or no success; 1 is what the best tenth of the "
-    "recorded episodes reached. A mark is the mean over seeds with the 95 % interval of the table; means beyond the axis are "
+    "recorded episodes reached. A mark is the mean over seeds with the 95 % interval of the table; one beyond the axis is "
     "drawn at its edge. A star marks data that a default was chosen with; the others judge the defaults."
 )
 COMPACT_TEXT = (
     "Final evaluation: success in percent, or mean return. Mean over seeds and 95 % interval: Student's t over seeds; of "
-    "success the wider one of that and Wilson's over the episodes of all seeds."
+    "success the wider one of that and Wilson's over the episodes of all seeds. Returns of one seed have no interval."
 )
 MINUTES_CAPTION = (
     "The same evaluations against minutes of training, without the evaluations' own: means over seeds at each gradient "
@@ -104,16 +104,25 @@ def _compact(group: Group) -> list[str]:
     rows = []
     for name, task, regime in group.data_sets:
         runs = [group.of(task, regime, algo) for algo in algos]
-        reached = [_over_seeds(final_interval(each), each) if each else NOT_RUN for each in runs]
+        reached = [_reached(each) if each else NOT_RUN for each in runs]
         rows.append([_escape(name), _recorded(next(each for each in runs if each)[0]), *reached])
     return [COMPACT_TEXT, "", *_table(["data set", "recorded; best tenth", *map(full_name, algos)], rows)]
 
 
+def _reached(runs: Sequence[Run]) -> str:
+    if runs[0].counts_success:
+        return _bracket(final_interval(runs), "{:.0f}".format) + " %"
+    return _bracket(final_interval(runs), _number)
+
+
 def _recorded(run: Run) -> str:
     """What the recorded episodes reached, and the best tenth of them."""
-    data, of_success = run.final["data"], run.counts_success
-    found = [data.get(key) for key in (("success_rate", "best_success") if of_success else ("mean_return", "best_return"))]
-    return "; ".join(NONE if each is None else _percent(100.0 * each) if of_success else _number(each) for each in found)
+    data = run.final["data"]
+    if run.counts_success:
+        shares = [data.get("success_rate"), data.get("best_success")]
+        return "; ".join(NONE if share is None else f"{share:.0%}".replace("%", " %") for share in shares)
+    returns = [data.get("mean_return"), data.get("best_return")]
+    return "; ".join(NONE if each is None else _number(each) for each in returns)
 
 
 def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
