@@ -94,7 +94,8 @@ def read_tasks(options: argparse.Namespace) -> list[Task]:
     :raises UsageError: a malformed option or entry, or no task at all
     :raises gymnasium.error.Error: an unknown task; names the nearest one
     """
-    given = _read_datasets_file(Path(options.datasets)) if options.datasets else {}
+    listed = _read_datasets_file(Path(options.datasets)) if options.datasets else {}
+    given = dict(listed)
     for text in options.dataset:
         task, _, dataset = text.partition("=")
         if not (task and dataset):
@@ -113,7 +114,7 @@ def read_tasks(options: argparse.Namespace) -> list[Task]:
         try:
             gym.spec(task.env_id)
         except gym.error.Error as error:
-            if task.name not in given or not options.datasets:
+            if task.name not in listed:
                 raise
             raise UsageError(f"{options.datasets}, {task.name}, task: {error}") from error
     return list(tasks.values())

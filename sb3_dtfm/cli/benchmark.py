@@ -21,7 +21,8 @@ The file of --datasets maps a task to its dataset, or to some of these keys:
   dataset         Minari id, robomimic file or flat arrays; the profile's by default
   target_return   to ask for, in reward units; what `sb3-dtfm inspect` suggests of the dataset by default
   recorded_from   the agent or demonstrator, for the report
-  env_kwargs      of the environment; dataset_kwargs: of the dataset's reader
+  env_kwargs      of the environment
+  dataset_kwargs  of the dataset's reader: clip_actions, action_bounds and others
   fraction        share of the dataset's episodes that the entry consists of, in (0, 1]
   gym_packages    modules to import first: they register the task
   algorithms      those of --algo that can learn it; all by default
