@@ -65,7 +65,10 @@ ROOMS = {
             "zoo",
         },
     ),
-    "benchmark": ("sb3_dtfm/benchmark", {"", "algorithms", "data", "envs", "optimization", "zoo", "benchmark", "files"}),
+    "benchmark": (
+        "sb3_dtfm/benchmark",
+        {"", "actions", "algorithms", "data", "envs", "optimization", "zoo", "benchmark", "files"},
+    ),
     "cli": (
         "sb3_dtfm/cli",
         {"", "actions", "algorithms", "data", "envs", "finetuning", "recording", "zoo", "benchmark", "files", "cli"},

@@ -17,6 +17,7 @@ from sb3_dtfm.benchmark import provenance
 from sb3_dtfm.benchmark.rows import Row, read_rows, write_row
 from sb3_dtfm.envs.success import reported_success
 from sb3_dtfm.files import replacing
+from sb3_dtfm.zoo.comparison import RandomActions
 
 # First seeds of the two sets of initial states: apart from each other, and from those of recordings, which count from 0.
 TRAINING_STATES = 1_000_000
@@ -25,6 +26,7 @@ FINAL_STATES = 2_000_000
 PROGRESS = re.compile(r"step (\d+) of (\d+): (.*)\n")
 PROGRESS_INTERVAL = 0.5  # seconds
 TIMED_BLOCKS, TIMED_ACTIONS = 8, 16
+N_RANDOM_EPISODES = 10  # whose mean return scores 0
 
 
 class Episodes(NamedTuple):
@@ -159,7 +161,7 @@ def action_ms(model: BaseAlgorithm, vec_env: VecEnv, seed: int) -> float:
 class EvaluationCallback(BaseCallback):
     """
     Evaluate before the first gradient step, every `eval_freq` of them and after the last one, and write a row each time;
-    after the last one also on initial states of its own, which nobody could choose a model by.
+    after the last one also on initial states of its own, which nobody could choose a model by, beside random actions.
 
     A YAML file of RL-Zoo may name it under `callback:`; all arguments are plain data.
 
@@ -193,7 +195,8 @@ class EvaluationCallback(BaseCallback):
         self._resumed, self._training_seconds, self._reported = 0.0, 0.0, 0.0
 
     def _init_callback(self) -> None:
-        self.vec_env = make_seeded_envs(self.row["task"], self.row["settings"], self.n_envs, self.subprocesses)
+        env_id = self.row.get("env_id", self.row["task"])
+        self.vec_env = make_seeded_envs(env_id, self.row["settings"], self.n_envs, self.subprocesses)
 
     def _on_training_start(self) -> None:
         self._resumed = time.perf_counter()
@@ -243,8 +246,16 @@ class EvaluationCallback(BaseCallback):
         )
         if final:
             evaluation["action_ms"] = round(action_ms(self.model, self.vec_env, first), 3)
+            if episodes.successes is None:
+                evaluation["data"] = {**self.row["data"], "random_return": self._random_return()}
         write_row(self.rows, {**self.row, **evaluation})
         self._resumed = time.perf_counter()
+
+    def _random_return(self) -> float:
+        """Mean return of random actions: what scores 0 where the task does not report success."""
+        random: Any = RandomActions(self.vec_env, seed=0)
+        seeds = range(FINAL_STATES, FINAL_STATES + N_RANDOM_EPISODES)
+        return round(float(np.mean(evaluate(random, self.vec_env, seeds).returns)), 4)
 
     def _report(self, what: str) -> None:
         """

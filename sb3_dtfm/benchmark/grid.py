@@ -2,6 +2,7 @@
 
 import argparse
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -10,12 +11,49 @@ from typing import Any
 import gymnasium as gym
 
 from sb3_dtfm.algorithms import ALGORITHMS
-from sb3_dtfm.benchmark.provenance import describe_data
-from sb3_dtfm.benchmark.rows import Cell, Row, read_rows
-from sb3_dtfm.benchmark.settings import Task, check_same_trunk, profile_name, read_yaml, task_settings
-from sb3_dtfm.zoo.arguments import UsageError
+from sb3_dtfm.benchmark.provenance import describe_data, read_data
+from sb3_dtfm.benchmark.rows import BASELINES, Cell, Row, read_rows
+from sb3_dtfm.benchmark.settings import (
+    Task,
+    check_same_trunk,
+    cloning_settings,
+    profile_name,
+    read_yaml,
+    task_settings,
+)
+from sb3_dtfm.data.inspection import suggested_target_return
+from sb3_dtfm.zoo.arguments import UsageError, asked_for, asking_for, import_packages
 
 N_EVALUATIONS = 10  # of a run, unless --eval-freq says otherwise
+# What --algo takes.
+ALGOS = (*ALGORITHMS, *BASELINES)
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _is_mapping(value: Any) -> bool:
+    return isinstance(value, dict)
+
+
+def _is_share(value: Any) -> bool:
+    return isinstance(value, float | int) and 0.0 < value <= 1.0
+
+
+# Keys of an entry of the file of --datasets: what is accepted, and whether a value is.
+ENTRY: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "task": ("a Gymnasium id", _is_text),
+    "dataset": ("a Minari id or the path of a file", _is_text),
+    "target_return": ("a number", lambda value: type(value) in (float, int)),
+    "recorded_from": ("a text", _is_text),
+    "env_kwargs": ("a mapping", _is_mapping),
+    "dataset_kwargs": ("a mapping", _is_mapping),
+    "fraction": ("a number in (0, 1]", _is_share),
+    "gym_packages": ("a list of modules", lambda value: isinstance(value, list) and all(map(_is_text, value))),
+    "algorithms": (f"a list of {', '.join(ALGOS)}", lambda value: isinstance(value, list) and set(value) <= set(ALGOS)),
+    "chosen_with": ("true or false", lambda value: isinstance(value, bool)),
+}
 
 
 @dataclass(frozen=True)
@@ -24,12 +62,14 @@ class Job:
     One cell and all that its process needs.
 
     :param cell: its identity
-    :param settings: what RL-Zoo's `train` reads from its YAML file
+    :param task: the task and its data
+    :param settings: what its process reads from a YAML file, RL-Zoo's `train` for example
     :param data: what the rows say of the dataset
     :param eval_freq: gradient steps between two evaluations
     """
 
     cell: Cell
+    task: Task
     settings: dict[str, Any]
     data: dict[str, Any]
     eval_freq: int
@@ -39,16 +79,23 @@ class Job:
         """Gradient steps."""
         return int(self.settings["n_timesteps"])
 
+    @property
+    def row(self) -> Row:
+        """What all of its rows say."""
+        renamed = {} if self.task.env_id == self.cell.task else {"env_id": self.task.env_id}
+        return {**self.cell._asdict(), **renamed, "settings": self.settings, "data": self.data}
+
 
 def read_tasks(options: argparse.Namespace) -> list[Task]:
     """
     The tasks of the grid with their data.
 
     :param options: `tasks`, `dataset`, `datasets` and `target_return` count
-    :raises UsageError: a malformed option, or no task at all
+    :raises UsageError: a malformed option or entry, or no task at all
     :raises gymnasium.error.Error: an unknown task; names the nearest one
     """
-    given = _read_datasets_file(Path(options.datasets)) if options.datasets else {}
+    listed = _read_datasets_file(Path(options.datasets)) if options.datasets else {}
+    given = dict(listed)
     for text in options.dataset:
         task, _, dataset = text.partition("=")
         if not (task and dataset):
@@ -62,8 +109,14 @@ def read_tasks(options: argparse.Namespace) -> list[Task]:
         for each in [name] if separator else tasks:
             if each in tasks:
                 tasks[each] = tasks[each]._replace(target_return=_number(value, f"--target-return {text}"))
-    for name in tasks:
-        gym.spec(name)
+    for task in tasks.values():
+        import_packages(task.gym_packages, f"{options.datasets}, {task.name}, gym_packages:")
+        try:
+            gym.spec(task.env_id)
+        except gym.error.Error as error:
+            if task.name not in listed:
+                raise
+            raise UsageError(f"{options.datasets}, {task.name}, task: {error}") from error
     return list(tasks.values())
 
 
@@ -78,14 +131,16 @@ def _read_datasets_file(path: Path) -> dict[str, Task]:
     """
     :raises UsageError: not the mapping that `--help` shows
     """
-    keys = set(Task._fields) - {"env_id"}
     tasks = {}
     for name, entry in read_yaml(path).items():
-        values = {"dataset": entry} if isinstance(entry, str) else entry
-        if not isinstance(values, dict) or set(values) - keys:
-            raise UsageError(f"{path}, {name}: expected a dataset, or a mapping of {', '.join(sorted(keys))}.")
-        if values.get("target_return") is not None:
-            values = {**values, "target_return": _number(values["target_return"], f"{path}, {name}, target_return")}
+        values: Any = {"dataset": entry} if isinstance(entry, str) else entry
+        if not isinstance(values, dict) or not set(values) <= set(ENTRY):
+            raise UsageError(f"{path}, {name}: expected a dataset, or a mapping of {', '.join(ENTRY)}; got {entry!r}.")
+        values = {key: value for key, value in values.items() if value is not None}
+        for key, value in values.items():
+            accepted, accepts = ENTRY[key]
+            if not accepts(value):
+                raise UsageError(f"{path}, {name}, {key}: expected {accepted}, got {value!r}.")
         tasks[name] = Task(name, **values)
     return tasks
 
@@ -101,30 +156,61 @@ def plan(options: argparse.Namespace) -> tuple[list[Job], list[Cell]]:
     files = sorted(Path(options.results).rglob("*.jsonl"))  # in studies, too
     finished = {Cell.of(row): row for file in files for row in read_rows(file) if row["final"]}
     profile = profile_name(options.profile)
-    data: dict[str, dict[str, Any]] = {}
+    looked_at: dict[tuple[str, float], tuple[dict[str, Any], float]] = {}
     jobs: list[Job] = []
     done: list[Cell] = []
     # Seeds outermost: a grid that is cut short has seen every task.
     for seed, task, regime in product(options.seeds, read_tasks(options), options.fractions):
-        settings = {
-            algo: task_settings(options.profile, algo, task, regime, options.n_timesteps, options.hyperparams)
-            for algo in ALGORITHMS
-        }
-        check_same_trunk(settings, task.env_id)
-        for algo in options.algos:
-            cell, wanted = Cell(task.env_id, regime, algo, seed, profile, options.label), settings[algo]
+        for algo, wanted in _settings(task, regime, options).items():
+            cell, asks = Cell(task.name, regime, algo, seed, profile, options.label), asked_for(wanted.get("env_wrapper"))
+            if (rows := Path(options.results) / f"{cell.file_name}.jsonl") in files and cell not in finished:
+                raise UsageError(f"{cell}: {rows} is there, without a final evaluation of this cell; move it away.")
+            if (cell not in finished or asks is None) and (task.name, regime) not in looked_at:
+                looked_at[task.name, regime] = _look_at(task, wanted)
+            if asks is None:
+                suggested = looked_at[task.name, regime][1]
+                wanted["env_wrapper"] = asking_for(suggested, wanted.get("env_wrapper"))
             if cell in finished:
                 _check_same(cell, finished[cell], wanted, options)
                 done.append(cell)
                 continue
-            if (rows := Path(options.results) / f"{cell.file_name}.jsonl") in files:
-                raise UsageError(f"{cell}: {rows} is there, without a final evaluation of this cell; move it away.")
-            if task.env_id not in data:
-                kwargs = wanted.get("dataset_kwargs") or {}
-                data[task.env_id] = describe_data(task.env_id, wanted["dataset"], kwargs, task.recorded_from)
             eval_freq = options.eval_freq or max(1, int(wanted["n_timesteps"]) // N_EVALUATIONS)
-            jobs.append(Job(cell, wanted, data[task.env_id], eval_freq))
+            jobs.append(Job(cell, task, wanted, looked_at[task.name, regime][0], eval_freq))
     return jobs, done
+
+
+def _settings(task: Task, regime: float, options: argparse.Namespace) -> dict[str, dict[str, Any]]:
+    """
+    By algorithm, of those asked for that can learn the task.
+
+    :raises UsageError: settings that do not fit, or that differ by more than a head
+    """
+    own = {
+        algo: task_settings(options.profile, algo, task, regime, options.n_timesteps, options.hyperparams)
+        for algo in ALGORITHMS
+    }
+    check_same_trunk(own, task.name)
+    cloning = {algo: cloning_settings(algo, own["dt"], options.n_timesteps) for algo in BASELINES}
+    return {algo: {**own, **cloning}[algo] for algo in options.algos if algo in (task.algorithms or options.algos)}
+
+
+def _look_at(task: Task, settings: dict[str, Any]) -> tuple[dict[str, Any], float]:
+    """
+    What the rows say of a task's data, and the return to ask for that a run's share of them suggests.
+
+    :raises DatasetError: they cannot be read, or are of another task
+    :raises UsageError: the environment cannot be made
+    """
+    try:
+        buffer = read_data(task.env_id, settings)
+    except (ImportError, TypeError) as error:
+        raise UsageError(f"{task.name}, a task of {task.env_id}: {error}") from error
+    whole, share = (
+        buffer.random_fraction(fraction, settings["dataset_seed"])
+        for fraction in (task.fraction, settings["dataset_fraction"])
+    )
+    described = describe_data(whole, settings["dataset"], task.recorded_from)
+    return {**described, **({"chosen_with": True} if task.chosen_with else {})}, suggested_target_return(share)
 
 
 def _check_same(cell: Cell, found: Row, wanted: dict[str, Any], options: argparse.Namespace) -> None:

@@ -10,12 +10,14 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import h5py
 import numpy as np
 import torch as th
 
 import sb3_dtfm
-from sb3_dtfm.data import load_dataset
+from sb3_dtfm.data import TrajectoryBuffer, load_dataset
+from sb3_dtfm.data.inspection import BEST_SHARE, return_reference
 from sb3_dtfm.data.minari import is_minari, open_minari
 from sb3_dtfm.optimization import has_fast_bfloat16
 
@@ -73,21 +75,35 @@ def _cpu_name() -> str:
     return found[1] if found else platform.processor() or platform.machine()
 
 
-def describe_data(
-    env_id: str, dataset: str, dataset_kwargs: dict[str, Any], recorded_from: str | None = None
-) -> dict[str, Any]:
+def read_data(env_id: str, settings: dict[str, Any]) -> TrajectoryBuffer:
+    """
+    All episodes of a run's dataset, as `train` reads them: up to the time limit of its environment.
+
+    :param env_id: Gymnasium id
+    :param settings: of the run; `dataset`, `dataset_kwargs` and `env_kwargs` count
+    :raises DatasetError: it cannot be read, or was recorded on another task; versions may differ
+    """
+    with contextlib.closing(gym.make(env_id, **(settings.get("env_kwargs") or {}))) as env:
+        limit = None if env.spec is None else env.spec.max_episode_steps
+        known = {"action_space": env.action_space, "max_episode_steps": limit}
+    buffer = load_dataset(settings["dataset"], **{**known, **(settings.get("dataset_kwargs") or {})})
+    buffer.check_task(env_id)
+    return buffer
+
+
+def describe_data(buffer: TrajectoryBuffer, dataset: str, recorded_from: str | None = None) -> dict[str, Any]:
     """
     What a dataset was recorded from, and how good that was: the scale of normalised scores.
 
-    :param env_id: of the task
+    :param buffer: its episodes
     :param dataset: Minari id, robomimic file or flat arrays
-    :param dataset_kwargs: of :func:`~sb3_dtfm.data.load_dataset`
     :param recorded_from: the agent or demonstrator, read from the dataset's metadata if not given
-    :return: dataset (a file without its folder), recorded_from, n_episodes, n_steps, and mean_return of the episodes
-    :raises DatasetError: it cannot be read, or was recorded on another task; versions may differ
+    :return: dataset (a file without its folder), recorded_from, n_episodes, n_steps; mean_return and success_rate of the
+        episodes, best_return and best_success of the best tenth of them. Success, in [0, 1], is None where the data do not
+        tell
     """
-    buffer = load_dataset(dataset, **dataset_kwargs)
-    buffer.check_task(env_id)
+    reference, best = return_reference(buffer), buffer.best(best_share=BEST_SHARE)
+    best_success = float(best.successes.mean())
     in_file = Path(dataset).expanduser().is_file()
     in_hdf5 = h5py.is_hdf5(Path(dataset).expanduser())
     source_of = _robomimic_source if in_hdf5 else _minari_source if is_minari(dataset) else _not_named
@@ -96,7 +112,10 @@ def describe_data(
         "recorded_from": recorded_from or source_of(dataset),
         "n_episodes": buffer.n_episodes,
         "n_steps": len(buffer),
-        "mean_return": round(float(np.mean(buffer.episode_returns)), 4),
+        "mean_return": round(reference.recorded, 4),
+        "best_return": round(reference.best_tenth, 4),
+        "success_rate": reference.success_rate,
+        "best_success": None if np.isnan(best_success) else best_success,
     }
 
 

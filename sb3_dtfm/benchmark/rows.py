@@ -18,9 +18,12 @@ KEYS: dict[str, tuple[type, ...]] = {
     **dict.fromkeys(("solver", "commit"), (str, type(None))),
     **dict.fromkeys(("versions", "hardware", "settings", "data"), (dict,)),
 }
-# What earlier rows do not tell.
-OPTIONAL_KEYS: dict[str, tuple[type, ...]] = {"action_ms": (float, int)}
+# What earlier rows do not tell, and the Gymnasium id where the task has another name.
+OPTIONAL_KEYS: dict[str, tuple[type, ...]] = {"action_ms": (float, int), "env_id": (str,)}
 EPISODE_KEYS: dict[str, tuple[type, ...]] = {"returns": (float, int), "lengths": (float, int), "successes": (bool,)}
+
+# Behaviour cloning, beside which the algorithms are compared: the share of the episodes, the best ones, that it learns from.
+BASELINES = {"bc": 1.0, "bc-best": 0.1}
 
 Row = dict[str, Any]
 
@@ -33,9 +36,9 @@ class Cell(NamedTuple):
     """
     What one training run of the grid is known by; rows with the same cell belong to the same run.
 
-    :param task: Gymnasium id
-    :param regime: share of the dataset's episodes, in (0, 1]
-    :param algo: "dt" or "dtfm"
+    :param task: name of the task with its data, which is the Gymnasium id where nothing else was said
+    :param regime: share of its episodes, in (0, 1]
+    :param algo: "dt" or "dtfm", or one of `BASELINES`
     :param seed: of weights, batches and acting
     :param profile: name of the settings
     :param label: name of what else was changed, empty if nothing

@@ -1,4 +1,4 @@
-"""Runs the cells of a grid, each as `sb3-dtfm train` in a process of its own."""
+"""Runs the cells of a grid, each as `sb3-dtfm train`, or behaviour cloning, in a process of its own."""
 
 import argparse
 import contextlib
@@ -24,11 +24,12 @@ from tqdm import tqdm
 from sb3_dtfm.benchmark.evaluation import PROGRESS
 from sb3_dtfm.benchmark.grid import Job
 from sb3_dtfm.benchmark.provenance import n_cores
-from sb3_dtfm.benchmark.rows import RowError, finished_cells, read_rows
+from sb3_dtfm.benchmark.rows import BASELINES, RowError, finished_cells, read_rows
 from sb3_dtfm.files import replacing
 from sb3_dtfm.zoo.resuming import START
 
 TRAIN = [sys.executable, "-m", "sb3_dtfm", "train"]
+CLONE = [sys.executable, "-m", "sb3_dtfm.benchmark.cloning"]
 CALLBACK = "sb3_dtfm.benchmark.evaluation.EvaluationCallback"
 ROWS, SETTINGS, OUTPUT, LOGS = "rows.jsonl", "settings.yml", "output.log", "logs"
 PATIENCE = 10.0  # seconds that a process has to end after SIGTERM
@@ -91,13 +92,13 @@ class Runner:
 
         What the last attempt had come to is copied, if its settings were the same.
         """
-        logs, options = Path(self.options.log_folder) / job.cell.file_name, self.options
+        logs, options, env_id = Path(self.options.log_folder) / job.cell.file_name, self.options, job.task.env_id
         logs.mkdir(parents=True, exist_ok=True)
         earlier = sorted(logs.glob("attempt-*"), key=lambda path: path.stat().st_mtime)
         folder = Path(tempfile.mkdtemp(prefix="attempt-", dir=logs))
         arguments = {
             "rows": str(folder / ROWS),
-            "row": {**job.cell._asdict(), "settings": job.settings, "data": job.data},
+            "row": job.row,
             "eval_freq": job.eval_freq,
             "n_episodes": options.eval_episodes,
             "n_final_episodes": options.final_episodes,
@@ -106,7 +107,7 @@ class Runner:
         }
         own = job.settings.get("callback") or []
         callbacks = [*(own if isinstance(own, list) else [own]), {CALLBACK: arguments}]
-        settings = yaml.safe_dump({job.cell.task: {**job.settings, "callback": callbacks}})
+        settings = yaml.safe_dump({env_id: {**job.settings, "callback": callbacks}})
         (folder / SETTINGS).write_text(settings)
         for attempt in earlier[-1:]:
             with contextlib.suppress(OSError):  # killed before it had anything
@@ -137,15 +138,10 @@ class Runner:
 
         :raises CancelledError: the grid is being ended
         """
-        command = [*TRAIN, "--algo", job.cell.algo, "--env", job.cell.task, "--seed", str(job.cell.seed)]
-        command += ["--conf-file", str(folder / SETTINGS), "--log-folder", str(folder / LOGS), "--eval-freq", "-1"]
-        command += ["--verbose", "0", "--device", self.options.device, "--num-threads", str(self._n_threads)]
-        # RL-Zoo's name for an attempt's only run.
-        run = folder / LOGS / job.cell.algo / f"{EnvironmentName(job.cell.task)}_1"
-        if (run / START).is_file() and (folder / ROWS).is_file():
-            command += ["--resume", str(run)]
-        if self.options.gym_packages:
-            command += ["--gym-packages", *self.options.gym_packages]
+        is_baseline = job.cell.algo in BASELINES
+        command = [*CLONE, str(folder / SETTINGS)] if is_baseline else self._train_command(job, folder)
+        if packages := [*self.options.gym_packages, *job.task.gym_packages]:
+            command += ["--gym-packages", *packages]
         environment = {key: value for key, value in os.environ.items() if key not in ("RANK", "WORLD_SIZE")}
         environment["OMP_NUM_THREADS"] = str(self._n_threads)
         # A session of its own: Ctrl-C would have RL-Zoo save the model and end as if all were well.
@@ -158,6 +154,17 @@ class Runner:
             )
             self._processes.append(process)
         return process
+
+    def _train_command(self, job: Job, folder: Path) -> list[str]:
+        """`sb3-dtfm train` of a cell, which goes on where it left a checkpoint."""
+        command = [*TRAIN, "--algo", job.cell.algo, "--env", job.task.env_id, "--seed", str(job.cell.seed)]
+        command += ["--conf-file", str(folder / SETTINGS), "--log-folder", str(folder / LOGS), "--eval-freq", "-1"]
+        command += ["--verbose", "0", "--device", self.options.device, "--num-threads", str(self._n_threads)]
+        # RL-Zoo's name for an attempt's only run.
+        run = folder / LOGS / job.cell.algo / f"{EnvironmentName(job.task.env_id)}_1"
+        if (run / START).is_file() and (folder / ROWS).is_file():
+            command += ["--resume", str(run)]
+        return command
 
     def _follow(self, process: subprocess.Popen[str], job: Job, log: Path) -> None:
         """Show how far the cell is, and keep what else it prints, until it ends."""

@@ -2,13 +2,15 @@
 
 import copy
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import yaml
 
 from sb3_dtfm.algorithms import ALGORITHMS
+from sb3_dtfm.benchmark.rows import BASELINES
 from sb3_dtfm.zoo.arguments import UsageError, asking_for
 from sb3_dtfm.zoo.registration import packaged_config, policy_of, with_policy_options
 
@@ -18,21 +20,48 @@ GRID_KEYS = ("dataset_fraction", "dataset_seed", "seed")
 # Keys that RL-Zoo takes for itself; the others go to the constructor.
 ZOO_KEYS = {"n_timesteps", "n_envs", "normalize", "env_kwargs", "env_wrapper", "vec_env_wrapper", "callback", "frame_stack"}
 
+# Mappings whose entries replace those of the profile one by one.
+MERGED = ("env_kwargs", "dataset_kwargs")
+# Settings that behaviour cloning shares with the others, and its own.
+CLONING_SHARES = (
+    "dataset", "dataset_kwargs", "dataset_fraction", "dataset_seed", "env_kwargs", "env_wrapper", "vec_env_wrapper"
+)  # fmt: skip
+CLONING = {"n_timesteps": 5000, "batch_size": 256, "learning_rate": 1e-3, "hidden_sizes": [256, 256, 256]}
+
 
 class Task(NamedTuple):
     """
-    What is asked for one task beside the profile.
+    What is asked for one task beside the profile: an entry of the file of `--datasets`.
 
-    :param env_id: Gymnasium id
+    :param name: of the task with its data, by which rows and reports know it
     :param dataset: Minari id, robomimic file or flat arrays, None for the profile's
-    :param target_return: in reward units, None for the profile's
+    :param target_return: in reward units, None for the profile's, or what the data suggest
     :param recorded_from: the agent or demonstrator, None for what the dataset's metadata say
+    :param task: Gymnasium id, None where the name is it
+    :param env_kwargs: of `gymnasium.make`, beside the profile's
+    :param dataset_kwargs: of :func:`~sb3_dtfm.data.load_dataset`, beside the profile's
+    :param fraction: share of the dataset's episodes, in (0, 1], that counts as all of them
+    :param gym_packages: modules that register the task
+    :param algorithms: those that can learn it, None for all
+    :param chosen_with: a default was chosen with it, so that it does not judge the defaults
     """
 
-    env_id: str
+    name: str
     dataset: str | None = None
     target_return: float | None = None
     recorded_from: str | None = None
+    task: str | None = None
+    env_kwargs: Mapping[str, Any] = MappingProxyType({})
+    dataset_kwargs: Mapping[str, Any] = MappingProxyType({})
+    fraction: float = 1.0
+    gym_packages: Sequence[str] = ()
+    algorithms: Sequence[str] | None = None
+    chosen_with: bool = False
+
+    @property
+    def env_id(self) -> str:
+        """Gymnasium id."""
+        return self.task or self.name
 
 
 def profile_name(profile: str) -> str:
@@ -90,13 +119,18 @@ def task_settings(
     :param task: the task and its data
     :param regime: share of the episodes
     :param n_timesteps: gradient steps, None for the profile's
-    :param hyperparams: replace the profile's; `policy_kwargs` replace entry by entry, and may stand beside the others
+    :param hyperparams: replace the profile's; mappings of keyword arguments replace entry by entry, and options of the
+        policy may stand beside the others
+    :return: with a target return if the command, the file of datasets or the profile, for its own dataset, has one
     :raises UsageError: settings missing, unknown or not allowed here
     """
     settings = read_profile(profile, algo, task.env_id)
+    if task.dataset is not None and "dataset" in settings:  # to which the target return belongs
+        settings["env_wrapper"] = asking_for(None, settings.get("env_wrapper"))
     hyperparams = with_policy_options(hyperparams)
-    policy_kwargs = {**_policy_kwargs(settings), **_policy_kwargs(hyperparams)}
-    settings.update(hyperparams)
+    policy_kwargs = {**_mapping(settings, "policy_kwargs"), **_mapping(hyperparams, "policy_kwargs")}
+    merged = {key: {**_mapping(settings, key), **getattr(task, key), **_mapping(hyperparams, key)} for key in MERGED}
+    settings.update({**hyperparams, **{key: value for key, value in merged.items() if value}})
     for key in GRID_KEYS:
         if key in settings:
             raise UsageError(f"{key}: the grid sets it; leave it out of the profile and of -params.")
@@ -105,19 +139,32 @@ def task_settings(
     if task.dataset is not None:
         settings["dataset"] = task.dataset
     if task.target_return is not None:
-        settings["env_wrapper"] = asking_for(task.target_return, settings.get("env_wrapper") or [])
+        settings["env_wrapper"] = asking_for(task.target_return, settings.get("env_wrapper"))
     if n_timesteps is not None:
         settings["n_timesteps"] = n_timesteps
-    needed = {"dataset": "--dataset", "env_wrapper": "--target-return", "n_timesteps": "--n-timesteps"}
+    needed = {"dataset": "--dataset", "n_timesteps": "--n-timesteps"}
     missing = [option for key, option in needed.items() if key not in settings]
     if missing:
-        raise UsageError(f"{', '.join(missing)}: needed for {task.env_id}, which --profile {profile} does not list.")
-    settings.update(dataset_fraction=regime, dataset_seed=0)
+        raise UsageError(f"{', '.join(missing)}: needed for {task.name}, which --profile {profile} does not list.")
+    settings.update(dataset_fraction=task.fraction * regime, dataset_seed=0)
     try:
         yaml.safe_dump(settings)
     except yaml.YAMLError as error:
-        raise UsageError(f"{task.env_id}: a setting that YAML cannot hold: {' '.join(str(error).split())}") from error
+        raise UsageError(f"{task.name}: a setting that YAML cannot hold: {' '.join(str(error).split())}") from error
     return settings
+
+
+def cloning_settings(algo: str, settings: Mapping[str, Any], n_timesteps: int | None) -> dict[str, Any]:
+    """
+    What a cell of behaviour cloning is to read.
+
+    :param algo: one of `BASELINES`
+    :param settings: of DT or DTFM, whose data and environment are its own, too
+    :param n_timesteps: gradient steps, None for 5,000
+    """
+    shared = {key: settings[key] for key in CLONING_SHARES if key in settings}
+    asked = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
+    return {**shared, **CLONING, **asked, "best_share": BASELINES[algo]}
 
 
 def check_same_trunk(settings: dict[str, dict[str, Any]], task: str) -> None:
@@ -128,7 +175,7 @@ def check_same_trunk(settings: dict[str, dict[str, Any]], task: str) -> None:
     :param task: for the message
     :raises UsageError: names what differs
     """
-    flat = {algo: {**each, **_policy_kwargs(each)} for algo, each in settings.items()}
+    flat = {algo: {**each, **_mapping(each, "policy_kwargs")} for algo, each in settings.items()}
     common = [set.intersection(*map(of, ALGORITHMS)) for of in (_constructor_parameters, _policy_parameters)]
     for key in sorted(set.union(*common) - {"policy_kwargs"}):
         values = {algo: each.get(key) for algo, each in flat.items()}
@@ -137,13 +184,13 @@ def check_same_trunk(settings: dict[str, dict[str, Any]], task: str) -> None:
             raise UsageError(f"{key} of {task} is {found}; all need the same.")
 
 
-def _policy_kwargs(settings: dict[str, Any]) -> dict[str, Any]:
+def _mapping(settings: dict[str, Any], key: str) -> dict[str, Any]:
     """
-    :raises UsageError: they are no mapping
+    :raises UsageError: something else stands there
     """
-    found = settings.get("policy_kwargs") or {}
+    found = settings.get(key) or {}
     if not isinstance(found, dict):
-        raise UsageError(f"policy_kwargs is {found!r}, expected a mapping.")
+        raise UsageError(f"{key} is {found!r}, expected a mapping.")
     return found
 
 

@@ -5,19 +5,31 @@ from collections.abc import Sequence
 from typing import Any
 
 from sb3_dtfm.algorithms import ALGORITHMS
-from sb3_dtfm.benchmark.grid import N_EVALUATIONS, plan
+from sb3_dtfm.benchmark.grid import ALGOS, N_EVALUATIONS, plan
 from sb3_dtfm.benchmark.runner import run_grid
 from sb3_dtfm.zoo.arguments import UsageError, import_packages, key_values
 
 EXAMPLES = """\
 examples:
   sb3-dtfm benchmark --dataset robosuite/Lift-v0=datasets/lift.hdf5 --seeds 0 1 2
+  sb3-dtfm benchmark --datasets studies/suite.yml --env hopper cartpole --algo bc bc-best dt dtfm --fractions 1
   sb3-dtfm benchmark --env HalfCheetah-v5 --dataset HalfCheetah-v5=local/halfcheetah/expert-v0 --label ema \\
       -params ema_decay:0.99
 
-The file of --datasets maps a task to its dataset, or to dataset, target_return and recorded_from:
+The file of --datasets maps a task to its dataset, or to some of these keys:
+  task            Gymnasium id, where the entry has a name of its own: several entries may have the same task
+  dataset         Minari id, robomimic file or flat arrays; the profile's by default
+  target_return   to ask for, in reward units; what `sb3-dtfm inspect` suggests of the dataset by default
+  recorded_from   the agent or demonstrator, for the report
+  env_kwargs      of the environment
+  dataset_kwargs  of the dataset's reader: clip_actions, action_bounds and others
+  fraction        share of the dataset's episodes that the entry consists of, in (0, 1]
+  gym_packages    modules to import first: they register the task
+  algorithms      those of --algo that can learn it; all by default
+  chosen_with     true, where a default was chosen with it; the report marks it
+
   robosuite/Lift-v0: datasets/lift.hdf5
-  HalfCheetah-v5: {dataset: local/halfcheetah/expert-v0, target_return: 13000, recorded_from: "TQC, sampled actions"}
+  cheetah: {task: HalfCheetah-v5, dataset: local/halfcheetah/expert-v0, recorded_from: "TQC, sampled actions"}
 
 A cell that is finished in the results folder is not run again; one that was interrupted goes on from its checkpoint.
 """
@@ -32,13 +44,20 @@ def benchmark_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     several: dict[str, Any] = dict(nargs="+", action="extend", default=[])
-    algos = list(ALGORITHMS)
     grid = parser.add_argument_group("the grid").add_argument
-    grid("--env", "--tasks", dest="tasks", nargs="+", metavar="TASK", help="those with a dataset given, by default")
+    grid(
+        "--env",
+        "--tasks",
+        dest="tasks",
+        nargs="+",
+        metavar="TASK",
+        help="Gymnasium ids, or names in --datasets; those with a dataset by default",
+    )
     grid(
         "--fractions", type=float, nargs="+", default=[1.0, 0.5], metavar="SHARE", help="of the episodes; 1.0 0.5 by default"
     )
-    grid("--algo", dest="algos", nargs="+", choices=algos, default=algos, help="all by default")
+    baselines = f"{' and '.join(ALGORITHMS)} by default; bc clones behaviour, bc-best that of the best tenth of the episodes"
+    grid("--algo", dest="algos", nargs="+", choices=ALGOS, default=list(ALGORITHMS), help=baselines)
     grid("--seeds", "--seed", type=int, nargs="+", default=[0], metavar="SEED", help="0 by default")
     grid("--profile", default="default", help="default, paper, a YAML file, or a folder with dt.yml and dtfm.yml")
     grid("--gym-packages", nargs="+", default=[], metavar="MODULE", help="to import first: they register tasks")

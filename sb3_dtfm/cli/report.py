@@ -5,10 +5,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_dtfm.benchmark.report.changes import split_changes
-from sb3_dtfm.benchmark.report.figures import check_baselines, plot_group, plot_solved, read_baseline
+from sb3_dtfm.benchmark.report.figures import check_baselines, plot_group, plot_scores, plot_solved, read_baseline
 from sb3_dtfm.benchmark.report.runs import Group, Study, read_studies
 from sb3_dtfm.benchmark.report.tables import make_report
 from sb3_dtfm.benchmark.rows import plain_name
+
+# From so many on a grid with a row of learning curves for each is too long to be drawn.
+MANY_TASKS = 20
 
 
 def main(argv: Sequence[str]) -> None:
@@ -45,28 +48,33 @@ def main(argv: Sequence[str]) -> None:
     )
     output = Path(options.output)
     agent_line = not options.no_agent_line
-    figures: dict[tuple[str, str], list[str]] = {}
+    figures: dict[tuple[str, str], dict[str, str]] = {}
     taken: set[str] = set()
     for study in studies:
         for group in split_changes(study, studies)[0]:
-            curves, minutes, solved = (figure_name(kind, study, group) for kind in ("curves", "minutes", "solved"))
-            if curves in taken:
-                raise ValueError(f"{curves} would show two groups of {study.name}: a label has its folder's name.")
-            taken.add(curves)
-            drawn = [
-                plot_group(group, output / curves, "steps", baselines, agent_line),
-                plot_group(group, output / minutes, "minutes", agent_line=agent_line),
-                plot_solved(group, output / solved),
-            ]
-            figures[study.name, group.title] = [file.name for file in drawn if file is not None]
-            print(*(file for file in drawn if file is not None), sep="\n")
+            files = {kind: output / figure_name(kind, study, group) for kind in ("scores", "curves", "minutes", "solved")}
+            if files["curves"].name in taken:
+                what = f"{files['curves'].name} would show two groups of {study.name}"
+                raise ValueError(f"{what}: a label has its folder's name.")
+            taken.add(files["curves"].name)
+            drawn = {"scores": plot_scores(group, files["scores"])} if group.has_baselines else {}
+            if len(group.tasks) < MANY_TASKS:
+                drawn["curves"] = plot_group(group, files["curves"], "steps", baselines, agent_line)
+                drawn["minutes"] = plot_group(group, files["minutes"], "minutes", agent_line=agent_line)
+                drawn["solved"] = plot_solved(group, files["solved"])
+            shown = {kind: file for kind, file in drawn.items() if file is not None}
+            figures[study.name, group.title] = {kind: file.name for kind, file in shown.items()}
+            print(*shown.values(), sep="\n")
     report = output / "report.md"
     report.write_text(make_report(studies, figures))
     print(report)
 
 
 def figure_name(kind: str, study: Study, group: Group) -> str:
-    """File name of a group's figure: "curves" of learning, these by "minutes", or what was "solved" by environment step."""
+    """
+    File name of a group's figure: "scores" beside behaviour cloning, "curves" of learning, these by "minutes", or what was
+    "solved" by environment step.
+    """
     return (
         plain_name("-".join(part for part in dict.fromkeys((kind, group.profile, group.label, study.name)) if part)) + ".png"
     )

@@ -29,18 +29,38 @@ class UsageError(ValueError):
 
 def asking_for(target_return: float | None, env_wrapper: Any) -> list[dict[Any, dict[str, Any]]]:
     """
-    Wrappers of an environment with the target return that it asks for.
+    Wrappers of an environment with its target return.
 
-    :param target_return: environment reward units; None leaves it as it is
+    :param target_return: environment reward units; None takes what the settings say away
     :param env_wrapper: RL-Zoo's setting: a wrapper, its path, one of these with its arguments, a list of these, or None
     :return: the same wrappers with their arguments; a ReturnToGoWrapper follows where there was none
     """
+    wrappers = _with_arguments(env_wrapper)
+    if not any(_shows_return_to_go(wrapper) for wrapper, _ in wrappers):
+        wrappers.append((WRAPPER, {}))
+    target = {} if target_return is None else {"target_return": target_return}
+    asking = []
+    for wrapper, arguments in wrappers:
+        if _shows_return_to_go(wrapper):
+            arguments = {key: value for key, value in arguments.items() if key != "target_return"} | target
+        asking.append({wrapper: arguments})
+    return asking
+
+
+def asked_for(env_wrapper: Any) -> float | None:
+    """
+    :param env_wrapper: as in :func:`asking_for`
+    :return: the target return of its ReturnToGoWrapper, None where there is none
+    """
+    own = (arguments for wrapper, arguments in _with_arguments(env_wrapper) if _shows_return_to_go(wrapper))
+    return next(own, {}).get("target_return")
+
+
+def _with_arguments(env_wrapper: Any) -> list[tuple[Any, dict[str, Any]]]:
+    """Each wrapper, or its path, with its arguments."""
     given = env_wrapper if isinstance(env_wrapper, list) else [env_wrapper] if env_wrapper else []
     pairs = [next(iter(each.items())) if isinstance(each, dict) else (each, None) for each in given]
-    if not any(map(_shows_return_to_go, (wrapper for wrapper, _ in pairs))):
-        pairs.append((WRAPPER, None))
-    target = {} if target_return is None else {"target_return": target_return}
-    return [{wrapper: {**(kwargs or {}), **(target if _shows_return_to_go(wrapper) else {})}} for wrapper, kwargs in pairs]
+    return [(wrapper, arguments or {}) for wrapper, arguments in pairs]
 
 
 def _shows_return_to_go(wrapper: str | type) -> bool:
@@ -67,11 +87,12 @@ def key_values(option: str, texts: Sequence[str]) -> dict[str, Any]:
     return values
 
 
-def import_packages(modules: Sequence[str]) -> None:
+def import_packages(modules: Sequence[str], where: str = "--gym-packages") -> None:
     """
     Import what registers tasks, as RL-Zoo's `--gym-packages` does; gymnasium-robotics needs no mention.
 
     :param modules: dotted names
+    :param where: they were named, for the message
     :raises UsageError: there is none of that name
     """
     register_gymnasium_robotics()
@@ -79,7 +100,7 @@ def import_packages(modules: Sequence[str]) -> None:
         try:
             importlib.import_module(module)
         except ModuleNotFoundError as error:
-            raise UsageError(f"--gym-packages {module}: {error}.") from error
+            raise UsageError(f"{where} {module}: {error}.") from error
 
 
 def train_parser() -> argparse.ArgumentParser:

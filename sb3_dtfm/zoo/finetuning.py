@@ -155,7 +155,7 @@ class FinetuningManager(OfflineExperimentManager):
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = hyperparams.get("env_kwargs") or self.env_kwargs
         if self.target_return is not None:
-            hyperparams["env_wrapper"] = asking_for(self.target_return, hyperparams.get("env_wrapper") or [])
+            hyperparams["env_wrapper"] = asking_for(self.target_return, hyperparams.get("env_wrapper"))
         if not hyperparams.get("env_wrapper"):
             raise UsageError(f"--target-return: needed, as {self.base} does not tell what return was asked for.")
         if self.evaluations_of_a_run is not None:

@@ -23,7 +23,7 @@ from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.arguments import with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.distributed import is_first_process
-from sb3_dtfm.zoo.arguments import UsageError, asking_for
+from sb3_dtfm.zoo.arguments import UsageError, asked_for, asking_for
 from sb3_dtfm.zoo.comparison import MeasureRandomActions, compare
 from sb3_dtfm.zoo.registration import with_policy_options
 from sb3_dtfm.zoo.resuming import CHECKPOINT, KeepCheckpoint, ReplaceEvaluations, Start, StopSignals, go_on
@@ -77,7 +77,8 @@ class OfflineExperimentManager(ExperimentManager):
             return hyperparams, saved
         hyperparams = with_policy_options(hyperparams)
         if self.learns_offline:
-            hyperparams = {**hyperparams, "env_wrapper": asking_for(None, hyperparams.get("env_wrapper"))}
+            wrappers = hyperparams.get("env_wrapper")
+            hyperparams = {**hyperparams, "env_wrapper": asking_for(asked_for(wrappers), wrappers)}
         return hyperparams, OrderedDict(sorted(hyperparams.items()))
 
     @property

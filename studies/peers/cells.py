@@ -228,9 +228,7 @@ def run_peer(
     return {
         **peer_cell(data, peer, seed, options.label)._asdict(),
         "settings": row_settings(data, peer, budget),
-        "data": provenance.describe_data(
-            data.task, data.dataset, data.settings().get("dataset_kwargs") or {}, data.recorded_from
-        ),
+        "data": provenance.describe_data(provenance.read_data(data.task, data.settings()), data.dataset, data.recorded_from),
         "commit": provenance.commit(),
         "versions": {**provenance.versions(), **{f"peer's {name}": number for name, number in process.versions.items()}},
         "step": n_steps,

@@ -38,7 +38,7 @@ from peers.cells import (
 )
 from peers.process import STUDIES, PeerError
 from sb3_dtfm.algorithms import ALGORITHMS
-from sb3_dtfm.benchmark.provenance import describe_data
+from sb3_dtfm.benchmark.provenance import read_data
 from sb3_dtfm.benchmark.rows import write_row
 from sb3_dtfm.cli import benchmark
 from sb3_dtfm.data import DatasetError
@@ -116,7 +116,7 @@ def ready(data: Data, asked_for: bool) -> bool:
         print(f"{data.name}: left out. {error}")
         return False
     try:
-        describe_data(data.task, data.dataset, data.settings().get("dataset_kwargs") or {}, data.recorded_from)
+        read_data(data.task, data.settings())
     except DatasetError as error:
         raise UsageError(f"{data.name}: {error} studies/peers.yml says how to record it; --data chooses others.") from error
     return True

@@ -4,12 +4,24 @@ from pathlib import Path
 
 import pytest
 
+from sb3_dtfm.benchmark import grid
+from sb3_dtfm.benchmark.grid import read_tasks
+from sb3_dtfm.cli.benchmark import parse_arguments
 from sb3_dtfm.cli.main import main
 
 ROOT = Path(__file__).parents[2]
 # Where a report lies, and of what it is; results/README.md has the commands.
 STUDIES = ("time-steps", "windows/*_uniform-windows.jsonl", "paused", "mixed", "few", "noisy", "two-ways", "styles")
 REPORTS = {"docs": ("grid/*_small.jsonl",), "docs/studies": STUDIES}
+
+
+def test_the_suite_of_data_sets_is_what_the_benchmark_reads(monkeypatch):
+    monkeypatch.setattr(grid, "import_packages", lambda *_: None)  # which not everybody has
+    monkeypatch.setattr(grid.gym, "spec", lambda _: None)
+    tasks = read_tasks(parse_arguments(["--datasets", str(ROOT / "studies" / "suite.yml")]))
+    assert len(tasks) > 30
+    assert all(task.task and task.dataset for task in tasks)
+    assert 0 < sum(task.chosen_with for task in tasks) < len(tasks) / 2
 
 
 @pytest.mark.parametrize("docs", REPORTS)

@@ -155,6 +155,7 @@ def test_rows_come_before_during_and_after_training_and_at_the_end_on_other_stat
     assert [each.get("action_ms", 0.0) > 0.0 for each in rows] == [False] * 4 + [True]
     walls = [each["wall_s"] for each in rows]
     assert walls == sorted(walls)
+    assert [sorted(each["data"]) for each in rows] == [[]] * 4 + [["random_return"]]
     # The last two rows are of the same weights, on the states that their seeds give
     envs = make_seeded_envs(row["task"], row["settings"], 1)
     for each, first in ((rows[3], TRAINING_STATES), (rows[4], FINAL_STATES)):

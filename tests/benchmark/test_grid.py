@@ -21,8 +21,10 @@ from sb3_dtfm.benchmark.rows import read_rows, write_row
 from sb3_dtfm.benchmark.settings import Task, task_settings
 from sb3_dtfm.cli.benchmark import parse_arguments
 from sb3_dtfm.cli.main import main
+from sb3_dtfm.data import load_dataset
+from sb3_dtfm.data.inspection import suggested_target_return
 from sb3_dtfm.heads import HEADS
-from sb3_dtfm.zoo.arguments import UsageError
+from sb3_dtfm.zoo.arguments import UsageError, asked_for, asking_for
 from tests.recorded import DATASET_ID
 
 TASK = "HalfCheetah-v5"
@@ -245,6 +247,107 @@ def test_tasks_come_from_a_file_or_from_pairs(tmp_path):
     assert read_tasks(parse_arguments(["--env", TASK, "--target-return", "9"])) == [Task(TASK, None, 9.0)]
 
 
+ENTRIES = {
+    "whole": {"dataset": DATASET_ID, "task": TASK, "env_kwargs": {"max_episode_steps": 10}, "chosen_with": True},
+    "some": {
+        "dataset": DATASET_ID,
+        "task": TASK,
+        "env_kwargs": {"max_episode_steps": 20, "ctrl_cost_weight": 0.2},
+        "dataset_kwargs": {"on_invalid": "drop"},
+        "fraction": 0.67,
+        "algorithms": ["bc", "dt"],
+        "gym_packages": ["gymnasium"],
+    },
+}
+
+
+@pytest.fixture
+def suite(workplace) -> list[str]:
+    """Arguments of a grid of two data sets of the same task."""
+    (workplace / "suite.yml").write_text(yaml.safe_dump(ENTRIES, sort_keys=False))
+    (workplace / "tiny.yml").write_text(yaml.safe_dump({"default": SETTINGS}))
+    arguments = ["--datasets", "suite.yml", "--profile", "tiny.yml", "--algo", "bc", "bc-best", "dt", "dtfm"]
+    return [*arguments, "--eval-freq", "6", "--eval-episodes", "2", "--final-episodes", "3", "--n-eval-envs", "2"]
+
+
+def test_several_data_sets_of_a_task_are_told_apart_by_their_names(suite):
+    jobs, _ = plan(parse_arguments(suite))
+    found = [(job.cell.task, job.cell.regime, job.cell.algo) for job in jobs]
+    whole = [("whole", regime, algo) for regime in (1.0, 0.5) for algo in ("bc", "bc-best", "dt", "dtfm")]
+    assert found == [*whole, *(("some", regime, algo) for regime in (1.0, 0.5) for algo in ("bc", "dt"))]
+    assert {job.row["env_id"] for job in jobs} == {TASK}
+    assert [job.data.get("chosen_with", False) for job in jobs] == [True] * 8 + [False] * 4
+    some = [job for job in jobs if job.cell.task == "some"]
+    assert [job.settings["dataset_fraction"] for job in some] == [0.67, 0.67, 0.335, 0.335]
+    assert {job.data["n_episodes"] for job in some} == {2}, "of three, whatever share of the two is learned from"
+    assert {job.data["n_steps"] for job in some} == {40}, "up to the time limit"
+    assert {job.settings["env_kwargs"]["ctrl_cost_weight"] for job in some} == {0.2}
+    assert {job.settings["dataset_kwargs"]["on_invalid"] for job in some} == {"drop"}
+
+
+def test_what_the_command_says_of_data_and_environment_goes_before_the_entry_key_by_key(suite):
+    more = ["--env", "some", "--env-kwargs", "ctrl_cost_weight:0.3", "--dataset-cache", "cache", "--target-return", "9"]
+    (job, *_), _ = plan(parse_arguments([*suite, *more]))
+    assert job.settings["env_kwargs"] == {"max_episode_steps": 20, "ctrl_cost_weight": 0.3}
+    assert job.settings["dataset_kwargs"] == {"on_invalid": "drop", "cache_dir": "cache"}
+    assert asked_for(job.settings["env_wrapper"]) == 9.0
+
+
+def test_the_data_suggest_a_return_to_ask_for_where_nobody_names_one(suite, workplace):
+    """Nor the profile's is taken, which belongs to its own dataset."""
+    (workplace / "tiny.yml").write_text(
+        yaml.safe_dump({"default": {**SETTINGS, "dataset": "their/own-v0", "env_wrapper": asking_for(7.0, [])}})
+    )
+    jobs, _ = plan(parse_arguments([*suite, "--env", "whole", "--fractions", "1", "0.4"]))
+    buffer = load_dataset(DATASET_ID, max_episode_steps=10)
+    asked = {job.cell.regime: asked_for(job.settings["env_wrapper"]) for job in jobs}
+    shares = {regime: suggested_target_return(buffer.random_fraction(regime, 0)) for regime in (1.0, 0.4)}
+    assert asked == shares
+    assert jobs[0].data["best_return"] == pytest.approx(buffer.episode_returns.max(), abs=1e-3)
+
+
+def test_a_suite_with_behaviour_cloning_runs_is_not_run_again_and_makes_a_report(suite, workplace, monkeypatch, capfd):
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
+    command = ["benchmark", *suite, "--env", "some", "--fractions", "1", "-n", "6"]
+    assert main(command) == 0
+    rows = {each[0]["algo"]: each for each in map(read_rows, Path("results").glob("some_1_*.jsonl"))}
+    assert set(rows) == {"bc", "dt"}
+    for each in rows.values():
+        assert [row["step"] for row in each] == [0, 6, 6]
+        assert {(row["task"], row["env_id"]) for row in each} == {("some", TASK)}
+        assert {length for row in each for length in row["lengths"]} == {20}
+    finals = [each[-1] for each in rows.values()]
+    assert len({row["data"]["random_return"] for row in finals}) == 1, "the same random actions for all"
+    assert main(command) == 0
+    assert "0 cells to run, 2 finished already" in capfd.readouterr().out
+    assert main(["report", "results", "-o", "docs"]) == 0
+    report = (workplace / "docs" / "report.md").read_text()
+    assert "| data set | recorded; best tenth | BC | DT | DTFM |" in report
+    assert (workplace / "docs" / "scores-tiny.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ({"datset": "a"}, "mine: expected a dataset, or a mapping of task, dataset, target_return,"),
+        ({"fraction": 2}, "mine, fraction: expected a number in (0, 1], got 2."),
+        ({"algorithms": ["td3"]}, "mine, algorithms: expected a list of dt, dtfm, bc, bc-best, got ['td3']."),
+        ({"env_kwargs": 3}, "mine, env_kwargs: expected a mapping, got 3."),
+        ({"target_return": "much"}, "mine, target_return: expected a number, got 'much'."),
+        ({"chosen_with": "yes"}, "mine, chosen_with: expected true or false, got 'yes'."),
+        ({"gym_packages": ["no_such_module"]}, "mine, gym_packages: no_such_module: No module named"),
+        ({"task": "HalfCheeta-v5"}, "mine, task: Environment `HalfCheeta` doesn't exist. Did you mean: `HalfCheetah`?"),
+        ({"task": TASK, "env_kwargs": {"colour": 1}}, f"mine, a task of {TASK}: "),
+    ],
+)
+def test_a_mistake_in_an_entry_is_told_with_its_file_its_name_and_its_key(entry, message, workplace, capsys):
+    (workplace / "suite.yml").write_text(yaml.safe_dump({"mine": {"dataset": DATASET_ID, **entry}}))
+    (workplace / "tiny.yml").write_text(yaml.safe_dump({"default": SETTINGS}))
+    assert main(["benchmark", "--datasets", "suite.yml", "--profile", "tiny.yml"]) == 2
+    (error,) = capsys.readouterr().err.strip().splitlines()
+    assert message in error
+
+
 def test_the_first_seed_of_everything_comes_first(grid, monkeypatch):
     options = parse_arguments([*grid[1:], "--seeds", "0", "1"])
     jobs, done = plan(options)
@@ -286,7 +389,7 @@ def test_algorithms_with_different_trunks_are_refused(grid, workplace):
             ["--dataset", f"Walker2d-v5={DATASET_ID}"],
             f"was recorded in {TASK}, and the environment is Walker2d-v5. If the data are meant for it, say so with",
         ),
-        (["--env", "Hopper-v5"], "--dataset, --target-return: needed for Hopper-v5"),
+        (["--env", "Hopper-v5"], "--dataset: needed for Hopper-v5"),
         (["--env", TASK, "--profile", "nowhere.yml"], "--profile nowhere.yml: nowhere.yml does not exist"),
         (["--env", TASK, "--fractions", "2"], "--fractions: must lie in (0, 1], got 2.0"),
         (["--env", TASK, "--jobs", "0"], "--jobs: must be at least 1, got 0"),

@@ -10,7 +10,7 @@ import pytest
 import torch as th
 
 from sb3_dtfm.benchmark import provenance
-from sb3_dtfm.data import DatasetError
+from sb3_dtfm.data import DatasetError, load_dataset
 from tests.recorded import DATASET_ID
 
 
@@ -50,11 +50,12 @@ def test_versions_and_hardware_fit_into_json():
 
 
 def test_a_minari_dataset_names_its_agent(workplace):
-    data = provenance.describe_data("HalfCheetah-v4", DATASET_ID, {})
+    buffer = provenance.read_data("HalfCheetah-v5", {"dataset": DATASET_ID})
+    data = provenance.describe_data(buffer, DATASET_ID)
     assert (data["dataset"], data["n_episodes"]) == (DATASET_ID, 3)
     assert data["recorded_from"].startswith("PPO: re-recorded from agent.zip: 3 episodes")
     assert data["n_steps"] == 3000
-    assert provenance.describe_data("HalfCheetah-v4", DATASET_ID, {}, "an agent")["recorded_from"] == "an agent"
+    assert provenance.describe_data(buffer, DATASET_ID, "an agent")["recorded_from"] == "an agent"
 
 
 @pytest.mark.parametrize(
@@ -67,11 +68,13 @@ def test_a_minari_dataset_names_its_agent(workplace):
 )
 def test_a_robomimic_file_names_its_task_and_not_its_folder(env_args, source, tmp_path):
     write_demonstrations(tmp_path / "lift.hdf5", env_args)
-    assert provenance.describe_data("robosuite/Lift-v0", str(tmp_path / "lift.hdf5"), {}) == {
+    path = str(tmp_path / "lift.hdf5")
+    assert provenance.describe_data(load_dataset(path), path) == {
         "dataset": "lift.hdf5", "recorded_from": source, "n_episodes": 2, "n_steps": 6, "mean_return": 1.0,
+        "best_return": 1.0, "success_rate": 1.0, "best_success": 1.0,
     }  # fmt: skip
 
 
 def test_a_dataset_that_cannot_be_read_is_refused(tmp_path):
     with pytest.raises(DatasetError, match=r"nothing\.hdf5"):
-        provenance.describe_data("robosuite/Lift-v0", str(tmp_path / "nothing.hdf5"), {})
+        provenance.read_data("Pendulum-v1", {"dataset": str(tmp_path / "nothing.hdf5")})

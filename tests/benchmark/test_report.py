@@ -1,6 +1,7 @@
 """The report on small committed rows, whose numbers can be worked out by hand."""
 
 import math
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from sb3_dtfm.benchmark.report.runs import (
     spread,
     steps_to_success,
 )
-from sb3_dtfm.benchmark.rows import Cell
+from sb3_dtfm.benchmark.rows import Cell, Row, write_row
 from sb3_dtfm.cli.main import main
 from tests.benchmark.conftest import make_row
 
@@ -270,6 +271,78 @@ def test_a_third_algorithm_has_its_columns_and_its_comparison(tmp_path):
     assert table_row(text, LIFT, "100%")[0][-1] == "2 / 3 / 3"
     assert "P(DTFM > DT)" in text
     assert "P(MEAN > DT)" in text
+
+
+def cloned(task: str, algo: str, seed: int, value: float, **changes) -> Row:
+    """A final evaluation: a return of `value`, which random actions and recordings surround, or successes."""
+    data = {"mean_return": -100.0, "best_return": 100.0, "random_return": -300.0, "success_rate": None, **changes}
+    successes = [i < value for i in range(4)] if task == "lift-10" else None
+    ended = dict(returns=[value] * 4, lengths=[9] * 4, successes=successes)
+    return make_row(task=task, env_id="Gym-v0", algo=algo, seed=seed, profile="default", data=data, **ended)
+
+
+SUCCESSES = {"success_rate": 0.25, "best_success": 0.5}
+SUITE = [
+    *(cloned("hopper", algo, seed, 20.0 * i + 100.0 * seed) for i, algo in enumerate(("bc", "dtfm")) for seed in (0, 1)),
+    cloned("hopper", "bc-best", 0, 100.0),
+    *(cloned("lift-10", algo, 0, n, chosen_with=True, **SUCCESSES) for algo, n in (("bc", 1), ("dtfm", 2))),
+]
+
+
+def write_suite(folder: Path, rows: Sequence[Row]) -> None:
+    for row in rows:
+        write_row(folder / "rows.jsonl", row)
+
+
+def test_a_score_goes_from_random_actions_to_the_best_tenth_of_what_was_recorded():
+    (group,), _ = group_runs(SUITE)
+    scores = {(run.cell.task, run.cell.algo, run.cell.seed): run.score("final") for of in group.runs.values() for run in of}
+    # From -300 to 100; of four episodes one and two succeed, and half of the best tenth did
+    assert scores == {
+        ("hopper", "bc", 0): 0.75,
+        ("hopper", "bc", 1): 1.0,
+        ("hopper", "dtfm", 0): 0.8,
+        ("hopper", "dtfm", 1): 1.05,
+        ("hopper", "bc-best", 0): 1.0,
+        ("lift-10", "bc", 0): 0.5,
+        ("lift-10", "dtfm", 0): 1.0,
+    }
+    (worse,) = group_runs([cloned("hopper", "bc", 0, 5.0, random_return=200.0)])[0][0].of("hopper", 1.0, "bc")
+    assert worse.score("final") is None, "random actions are no worse than the recordings"
+
+
+def test_behaviour_cloning_beside_it_is_shown_in_one_table_and_one_figure(tmp_path, monkeypatch):
+    from matplotlib.figure import Figure
+
+    figures = {}
+    save = Figure.savefig
+    monkeypatch.setattr(
+        Figure, "savefig", lambda self, to, **kwargs: figures.update({to.name: self}) or save(self, to, **kwargs)
+    )
+    write_suite(tmp_path, SUITE)
+    assert main(["report", str(tmp_path), "-o", str(tmp_path)]) == 0
+    text = (tmp_path / "report.md").read_text()
+    assert "| data set | recorded; best tenth | BC | BC of the best tenth | DT | DTFM |" in text
+    # Student's t of two seeds that are 100 apart: 12.706 * 50
+    hopper, lift = table_row(text, "hopper")[0], table_row(text, "lift-10*")[0]
+    assert hopper == ["-100; 100", "50.00 [-585, 685]", "100", "*not run*", "70.00 [-565, 705]"]
+    assert lift == ["25 %; 50 %", "25 [5, 70] %", "*not run*", "*not run*", "50 [15, 85] %"]
+    assert "0 is the mean return of random actions, 1 is the mean return of the best tenth" in text
+    assert "](scores-default.png)" in text
+    (axis,) = figures["scores-default.png"].axes
+    assert [label.get_text() for label in axis.get_yticklabels()] == ["hopper", "lift-10*"]
+    marks = {(line.get_label(), round(float(np.mean(line.get_xdata())), 3)) for line in axis.lines[1:]}
+    assert marks >= {("BC", 0.875), ("DTFM", 0.925), ("BC of the best tenth", 1.0), ("BC", 0.5), ("DTFM", 1.0)}
+    (legend,) = figures["scores-default.png"].legends
+    assert {text.get_text() for text in legend.get_texts()} > {"BC", "BC of the best tenth", "DTFM"}
+
+
+def test_of_many_data_sets_no_learning_curves_are_drawn(tmp_path):
+    rows = [cloned(f"task-{i}", algo, 0, 5.0) for i in range(20) for algo in ("bc", "dtfm")]
+    write_suite(tmp_path, rows)
+    assert main(["report", str(tmp_path), "-o", str(tmp_path)]) == 0
+    assert [file.name for file in tmp_path.glob("*.png")] == ["scores-default.png"]
+    assert "learning curves" not in (tmp_path / "report.md").read_text()
 
 
 def test_a_label_alone_is_a_group_of_its_own(tmp_path):

@@ -24,7 +24,8 @@ ENJOY = ["enjoy", "--algo", "dt", "--env", "HalfCheetah-v5", "--no-render", "-n"
 def train(settings: dict, *arguments: str) -> int:
     """Four gradient steps with a YAML file of its own."""
     with open("own.yml", "w") as file:
-        yaml.safe_dump({"default": {"policy": "MultiInputPolicy", "n_timesteps": 4, **settings}}, file)
+        own = {"policy": "MultiInputPolicy", "n_timesteps": 4, "return_conditioning": True, **settings}
+        yaml.safe_dump({"default": own}, file)
     return main(tiny_training("dt", "--dataset", DATASET_ID, "--conf-file", "own.yml", *arguments))
 
 

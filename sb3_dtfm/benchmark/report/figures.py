@@ -1,23 +1,37 @@
-"""The figures of a comparison: a row for each task, shares of the data side by side."""
+"""The figures of a comparison: a row for each task, shares of the data side by side, or one row for each data set."""
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sb3_dtfm.benchmark.report.runs import OVER_EPISODES, OVER_SEEDS, THRESHOLD_NAME, Group, learning_curve, steps_to_success
+from sb3_dtfm.benchmark.report.runs import (
+    OVER_EPISODES,
+    OVER_SEEDS,
+    THRESHOLD_NAME,
+    Group,
+    full_name,
+    learning_curve,
+    score_interval,
+    steps_to_success,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart; markers differ too.
 STYLES = (("#D55E00", "s"), ("#0072B2", "o"), ("#56B4E9", "^"), ("#F0E442", "D"))
+SCORE_STYLES = {"bc": ("#E69F00", "v"), "bc-best": ("#009E73", "^"), "dt": STYLES[0], "dtfm": STYLES[1]}
+OTHER_STYLES = (("#CC79A7", "D"), ("#56B4E9", "P"), ("0.1", "X"))
 BASELINE_COLORS = ("#009E73", "#CC79A7", "#E69F00")
 AGENT_COLOR = "0.35"
 PANEL = (4.15, 2.5)  # inches; two panels are as wide as a README
+SCORE_ROW = 0.34  # inches
+SCORES_SHOWN = (-0.25, 1.5)  # at most
 # How a band is drawn; the legend shows it in grey.
 BANDS: dict[str, dict[str, Any]] = {
     OVER_EPISODES: dict(alpha=0.15, linewidth=0),
@@ -136,6 +150,54 @@ def plot_solved(group: Group, output: Path) -> Path | None:
     return output
 
 
+def plot_scores(group: Group, output: Path) -> Path | None:
+    """
+    Draw the scores of the final evaluation: a row for each data set, a mark for each algorithm.
+
+    :param group: the runs
+    :param output: PNG file to write
+    :return: `output`, or None if no data set has a scale
+    """
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    algos, data_sets = group.baselines_first, group.data_sets
+    styles = {**dict(zip((algo for algo in algos if algo not in SCORE_STYLES), cycle(OTHER_STYLES))), **SCORE_STYLES}
+    drawn = [
+        (row, algo, interval)
+        for row, (_, task, regime) in enumerate(data_sets)
+        for algo in algos
+        if (runs := group.of(task, regime, algo)) and (interval := score_interval(runs)) is not None
+    ]
+    if not drawn:
+        return None
+    means = [interval.estimate for *_, interval in drawn]
+    low, high = max(SCORES_SHOWN[0], min(0.0, *means)), min(SCORES_SHOWN[1], max(1.0, *means))
+    with mpl.rc_context({"font.size": 11, "axes.spines.top": False, "axes.spines.left": False, "axes.spines.right": False}):
+        figure = Figure(figsize=(2 * PANEL[0], SCORE_ROW * len(data_sets) + 1.2), layout="constrained")
+        FigureCanvasAgg(figure)
+        axis = figure.subplots()
+        for row in range(0, len(data_sets), 2):
+            axis.axhspan(row - 0.5, row + 0.5, color="0.95", linewidth=0)
+        axis.axvline(0.0, color="0.75", linewidth=0.8)
+        for row, algo, interval in drawn:
+            color, marker = styles[algo]
+            y = row + 0.8 * ((algos.index(algo) + 0.5) / len(algos) - 0.5)
+            axis.hlines(y, interval.low, interval.high, color=color, linewidth=1.4, alpha=0.5)
+            x = np.clip(interval.estimate, low, high)
+            style: dict[str, Any] = dict(
+                color=color, marker=marker, markersize=6.5, markeredgecolor="white", markeredgewidth=0.5
+            )
+            axis.plot(x, y, linestyle="", clip_on=False, zorder=3, label=full_name(algo), **style)
+        axis.axvline(1.0, color=AGENT_COLOR, linestyle="--", linewidth=1.2, label="best tenth of the recordings")
+        axis.set(xlim=(low - 0.03, high + 0.03), xlabel="score", ylim=(len(data_sets) - 0.5, -0.5))
+        axis.set_yticks(range(len(data_sets)), [name for name, *_ in data_sets])
+        axis.tick_params(axis="y", length=0)
+        _save(figure, [axis], output, ncols=min(len(algos) + 1, 5), columnspacing=1.3, handletextpad=0.4, handlelength=1.5)
+    return output
+
+
 @contextlib.contextmanager
 def _figure(group: Group, tasks: Sequence[str], output: Path, x_label: str) -> Iterator[np.ndarray]:
     """Panels (task, share of the data) to draw in, with one legend; saved at the end."""
@@ -156,15 +218,16 @@ def _figure(group: Group, tasks: Sequence[str], output: Path, x_label: str) -> I
         for axis in axes[-1]:
             axis.set_xlabel(x_label)
         yield axes
-        handles = {
-            label: handle for axis in axes.flat for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
-        }
-        figure.legend(
-            handles.values(), handles.keys(), loc="outside upper center", ncols=3 if width > 6.0 else 2, frameon=False
-        )
-        figure.align_ylabels()
-        output.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(output, dpi=150)
+        _save(figure, axes.flat, output, ncols=3 if width > 6.0 else 2)
+
+
+def _save(figure: "Figure", axes: Iterable["Axes"], output: Path, **legend: Any) -> None:
+    """With one legend of all that is drawn."""
+    handles = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside upper center", frameon=False, **legend)
+    figure.align_ylabels()
+    output.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(output, dpi=150)
 
 
 def _share(regime: float) -> str:

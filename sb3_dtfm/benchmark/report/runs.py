@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_dtfm.benchmark.report.statistics import Interval, mean_and_deviation, student_t, wilson
-from sb3_dtfm.benchmark.rows import Cell, Row, merge_rows, result_files
+from sb3_dtfm.benchmark.rows import BASELINES, Cell, Row, merge_rows, result_files
 
 # The paper's comparison, which is shown whether it was run or not.
 PAPER_ALGORITHMS = ("dt", "dtfm")
@@ -54,23 +54,50 @@ class Run(NamedTuple):
 
     def score(self, measure: str) -> float | None:
         """
-        The value on a scale common to tasks: success rate, or share of the recorded episodes' mean return.
+        The value on a scale common to tasks, see :meth:`to_score`.
 
         :return: None where there is no scale, or no value
         """
-        value, scale = self.value(measure), self.scale
-        return None if value is None or scale is None else value / scale
+        value = self.value(measure)
+        return None if value is None else self.to_score(value)
+
+    def to_score(self, value: float) -> float | None:
+        """
+        A value on the scale from what scores 0 to what scores 1.
+
+        :param value: success in percent, or mean return in reward units
+        :return: None where there is no scale
+        """
+        return None if self.scale is None else (value - self.zero) / (self.scale - self.zero)
+
+    @property
+    def knows_random(self) -> bool:
+        """Whether the return of random actions was measured, as it is since rows tell of the best tenth, too."""
+        return not self.counts_success and "random_return" in self.final["data"]
+
+    @property
+    def zero(self) -> float:
+        """What scores 0: no success, or the mean return of random actions; a return of 0 where that is not known."""
+        return float(self.final["data"]["random_return"]) if self.knows_random else 0.0
 
     @property
     def scale(self) -> float | None:
-        """What scores 1: 100 percent success, or the recorded mean return; None where that is not positive or not known."""
-        scale = 100.0 if self.counts_success else self.final["data"].get("mean_return")
-        return scale if isinstance(scale, float | int) and scale > 0 else None
+        """
+        What scores 1: the successes of the best tenth of the recorded episodes, in percent, or 100 where the data do not
+        tell; the mean return of the best tenth, or of all where that of random actions is not known.
+
+        :return: None where that is not known, or not above what scores 0
+        """
+        data = self.final["data"]
+        if self.counts_success:
+            return 100.0 * (data.get("best_success") or 1.0)
+        scale = data.get("best_return" if self.knows_random else "mean_return")
+        return scale if isinstance(scale, float | int) and scale > self.zero else None
 
     @property
     def threshold(self) -> float | None:
-        """95 % of the scale: success in percent, or mean return in reward units; None where there is no scale."""
-        return None if self.scale is None else THRESHOLD * self.scale
+        """95 % of the way from what scores 0 to what scores 1; None where there is no scale."""
+        return None if self.scale is None else self.zero + THRESHOLD * (self.scale - self.zero)
 
     @property
     def steps(self) -> int:
@@ -148,9 +175,29 @@ class Group(NamedTuple):
 
     @property
     def regimes(self) -> list[float]:
-        """Shares of the data, the paper's (unless something was changed) and those run, largest first."""
-        paper = () if self.label else PAPER_REGIMES
+        """Shares of the data, the paper's (unless it is another comparison) and those run, largest first."""
+        paper = () if self.label or self.has_baselines else PAPER_REGIMES
         return sorted({*paper, *(regime for _, regime, _ in self.runs)}, reverse=True)
+
+    @property
+    def has_baselines(self) -> bool:
+        """Whether behaviour cloning was run, too."""
+        return any(algo in BASELINES for _, _, algo in self.runs)
+
+    @property
+    def baselines_first(self) -> list[str]:
+        """The algorithms, behaviour cloning before the others."""
+        return sorted(self.algorithms, key=lambda algo: algo not in BASELINES)
+
+    @property
+    def data_sets(self) -> list[tuple[str, str, float]]:
+        """Of all that were run: a name, with a star where a default was chosen with it, the task, the share of its data."""
+        found = []
+        for task, regime in sorted({(task, regime) for task, regime, _ in self.runs}):
+            star = "*" if any(run.final["data"].get("chosen_with") for run in self.of_task(task)) else ""
+            share = f", {regime:.0%}" if len(self.regimes) > 1 else ""
+            found.append((f"{task}{star}{share}", task, regime))
+        return found
 
     @property
     def compares(self) -> bool:
@@ -196,6 +243,11 @@ def read_studies(paths: Iterable[str | os.PathLike[str]], tasks: Sequence[str] =
     """
     studies = [Study(name, *group_runs(merge_rows(files), tasks)) for name, files in result_files(paths).items()]
     return sorted(studies, key=lambda study: (all(group.label for group in study.groups), study.name))
+
+
+def full_name(algo: str) -> str:
+    """What figures and tables call an algorithm where there is room."""
+    return {"bc-best": "BC of the best tenth"}.get(algo, algo.upper())
 
 
 def row_value(row: Row) -> float:
@@ -249,6 +301,12 @@ def final_interval(runs: Sequence[Run]) -> Interval:
     low, high = np.clip(over_runs[1:], 0.0, 100.0).tolist()
     wider = high - low > over_episodes.high - over_episodes.low
     return Interval(over_runs.estimate, low, high) if wider else over_episodes
+
+
+def score_interval(runs: Sequence[Run]) -> Interval | None:
+    """The same on the scale of scores; None where there is none."""
+    scores = [runs[0].to_score(limit) for limit in final_interval(runs)]
+    return None if None in scores else Interval(*scores)  # type: ignore[arg-type]
 
 
 def late_interval(runs: Sequence[Run]) -> Interval | None:

@@ -16,6 +16,7 @@ from sb3_dtfm.benchmark.report.runs import (
     Run,
     Study,
     final_interval,
+    full_name,
     late_interval,
     paired_scores,
     spread,
@@ -38,6 +39,15 @@ CAPTION = (
 SOLVED_CAPTION = (
     "Share of the final episodes, of all seeds, that had succeeded by an environment step, and the median of it."
 )
+SCORES_CAPTION = (
+    "Scores of the final evaluation: 0 is the mean return of random actions, or no success; 1 is what the best tenth of the "
+    "recorded episodes reached. A mark is the mean over seeds with the 95 % interval of the table; one beyond the axis is "
+    "drawn at its edge. A star marks data that a default was chosen with; the others judge the defaults."
+)
+COMPACT_TEXT = (
+    "Final evaluation: success in percent, or mean return. Mean over seeds and 95 % interval: Student's t over seeds; of "
+    "success the wider one of that and Wilson's over the episodes of all seeds. Returns of one seed have no interval."
+)
 MINUTES_CAPTION = (
     "The same evaluations against minutes of training, without the evaluations' own: means over seeds at each gradient "
     f"step. The thin line is {THRESHOLD_NAME}."
@@ -52,13 +62,13 @@ TO_THRESHOLD_IS = (
 Say = Callable[[list[Run]], str]
 
 
-def make_report(studies: Sequence[Study], figures: Mapping[tuple[str, str], Sequence[str]]) -> str:
+def make_report(studies: Sequence[Study], figures: Mapping[tuple[str, str], Mapping[str, str]]) -> str:
     """
     The whole report.
 
     :param studies: what to report on, in this order
-    :param figures: file names by study and title of a group: of its learning curves by gradient step and by minutes, and of
-        its successes by environment step if any
+    :param figures: file names by study and title of a group, and by what they show: "scores" beside behaviour cloning,
+        "curves" of learning by gradient step, the same by "minutes", what was "solved" by environment step; each if drawn
     :return: Markdown
     """
     parts = ["# DT and DTFM compared", ""]
@@ -75,14 +85,44 @@ def make_report(studies: Sequence[Study], figures: Mapping[tuple[str, str], Sequ
     return "\n".join(parts)
 
 
-def _group(group: Group, figures: Sequence[str]) -> list[str]:
-    curves, minutes, *solved = figures
-    parts = [f"![learning curves]({curves})", "", CAPTION, "", *_achieved(group), "", *_intervals(group), ""]
-    for file in solved:
-        parts += [f"![episodes solved by environment step]({file})", "", SOLVED_CAPTION, "", *_steps(group), ""]
+def _group(group: Group, figures: Mapping[str, str]) -> list[str]:
+    def show(kind: str, title: str, caption: str) -> list[str]:
+        return [f"![{title}]({figures[kind]})", "", caption, ""] if kind in figures else []
+
+    parts = [*show("scores", "scores by data set", SCORES_CAPTION), *_compact(group), ""] if group.has_baselines else []
+    parts += [*show("curves", "learning curves", CAPTION), *_achieved(group), "", *_intervals(group), ""]
+    if group.success_tasks:
+        parts += [*show("solved", "episodes solved by environment step", SOLVED_CAPTION), *_steps(group), ""]
     parts += [*_scores(group), "", *_aggregates(group), ""]
-    parts += [f"![learning curves by minutes of training]({minutes})", "", MINUTES_CAPTION, "", *_time(group), ""]
+    parts += [*show("minutes", "learning curves by minutes of training", MINUTES_CAPTION), *_time(group), ""]
     return [*parts, *_sources(group), ""]
+
+
+def _compact(group: Group) -> list[str]:
+    """A row for each data set: what was recorded, and what each algorithm reached."""
+    algos = group.baselines_first
+    rows = []
+    for name, task, regime in group.data_sets:
+        runs = [group.of(task, regime, algo) for algo in algos]
+        reached = [_reached(each) if each else NOT_RUN for each in runs]
+        rows.append([_escape(name), _recorded(next(each for each in runs if each)[0]), *reached])
+    return [COMPACT_TEXT, "", *_table(["data set", "recorded; best tenth", *map(full_name, algos)], rows)]
+
+
+def _reached(runs: Sequence[Run]) -> str:
+    if runs[0].counts_success:
+        return _bracket(final_interval(runs), "{:.0f}".format) + " %"
+    return _bracket(final_interval(runs), _number)
+
+
+def _recorded(run: Run) -> str:
+    """What the recorded episodes reached, and the best tenth of them."""
+    data = run.final["data"]
+    if run.counts_success:
+        shares = [data.get("success_rate"), data.get("best_success")]
+        return "; ".join(NONE if share is None else f"{share:.0%}".replace("%", " %") for share in shares)
+    returns = [data.get("mean_return"), data.get("best_return")]
+    return "; ".join(NONE if each is None else _number(each) for each in returns)
 
 
 def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
@@ -197,8 +237,10 @@ def _scores(group: Group) -> list[str]:
     tasks = [task for task in group.tasks if not any(run.counts_success for run in group.of_task(task))]
     if not tasks:
         return ["Success needs no scale: the score of a run is its success rate."]
+    knows_random = any(run.knows_random for task in tasks for run in group.of_task(task))
+    zero, one = ("the mean return of random actions", " best tenth of the") if knows_random else ("a return of 0", "")
     text = (
-        "Normalised scores: 0 is a return of 0, 1 is the mean return of the recorded episodes (of the whole dataset, "
+        f"Normalised scores: 0 is {zero}, 1 is the mean return of the{one} recorded episodes (of the whole dataset, "
         "whatever share was learned from). Mean over seeds."
     )
     columns = {MEASURES[measure]: lambda runs, measure=measure: _share(runs, measure) for measure in ("late", "final")}
