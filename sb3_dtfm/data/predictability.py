@@ -71,8 +71,8 @@ def prediction_errors(buffer: TrajectoryBuffer) -> PredictionErrors | None:
         errors = (predicted - actions).square().mean(dim=1).numpy()
         return np.bincount(episode, errors) / np.bincount(episode)
 
-    regressed = [min(map(by_episode, _held_out(each, actions, part)), key=np.mean) for each in features]
-    return PredictionErrors(*regressed, by_episode(previous))
+    by_observation, by_return = (min(map(by_episode, _held_out(each, actions, part)), key=np.mean) for each in features)
+    return PredictionErrors(by_observation, by_return, by_episode(previous))
 
 
 def _features(
