@@ -99,8 +99,8 @@ def describe_data(buffer: TrajectoryBuffer, dataset: str, recorded_from: str | N
     :param dataset: Minari id, robomimic file or flat arrays
     :param recorded_from: the agent or demonstrator, read from the dataset's metadata if not given
     :return: dataset (a file without its folder), recorded_from, n_episodes, n_steps; mean_return and success_rate of the
-        episodes, best_return and best_success of the best tenth of them. Success, in [0, 1], is None where the data do not
-        tell
+        episodes, best_return and best_success of the best tenth of them; best_return is the mean of all where the start
+        decides, as the best had the luckiest starts. Success, in [0, 1], is None where the data do not tell
     """
     reference, best = return_reference(buffer), buffer.best(best_share=BEST_SHARE)
     best_success = float(best.successes.mean())
@@ -113,7 +113,7 @@ def describe_data(buffer: TrajectoryBuffer, dataset: str, recorded_from: str | N
         "n_episodes": buffer.n_episodes,
         "n_steps": len(buffer),
         "mean_return": round(reference.recorded, 4),
-        "best_return": round(reference.best_tenth, 4),
+        "best_return": round(reference.suggested, 4),
         "success_rate": reference.success_rate,
         "best_success": None if np.isnan(best_success) else best_success,
     }
