@@ -10,7 +10,7 @@ from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 
 TRUNK = dict(
     embed_dim=128, n_layers=3, n_heads=2, dropout=0.0, tokens_per_step=3, timestep_embedding=False, return_scaling="max",
-    clip_return_to_go=False, film_return_to_go=False, calm_units=False,
+    clip_return_to_go=False, film_return_to_go=False, calm_units=False, return_conditioning=True,
 )  # fmt: skip
 HEADS = {
     DT: {},
