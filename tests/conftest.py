@@ -23,6 +23,7 @@ TINY_POLICY = dict(
     clip_return_to_go=False,
     film_return_to_go=False,
     calm_units=False,
+    return_conditioning=True,
 )
 TINY_FLOW_POLICY = dict(
     TINY_POLICY,
