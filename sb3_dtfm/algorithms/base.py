@@ -74,8 +74,6 @@ ACCEPTED: dict[str, Rule] = {
 }
 # Arguments of the algorithm that the data decide where they are None; the policy's are among `policy_kwargs`.
 DECIDED = {"batch_size", "return_weight"}
-# What acts, and by which loss the trunk learns.
-TRAINED_BY = {"n_solver_steps", "regression_coef"}
 
 
 class OfflineAlgorithm(BaseAlgorithm, ABC):
@@ -114,7 +112,9 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
     :param precision: "float32", "bfloat16" (autocast), or "auto": bfloat16 where the hardware multiplies in it
     :param compile: compile the loss with `torch.compile`; None does so on a GPU, where one process starts its kernels as a
         CUDA graph. It takes a minute, and a C++ compiler
-    :param policy_kwargs: arguments of the policy, for example `embed_dim`, `n_layers`, `n_heads`, `dropout`, `kv_cache`
+    :param policy_kwargs: arguments of the policy, for example `embed_dim`, `n_layers`, `n_heads`, `dropout`, `kv_cache`. The
+        data decide `dropout`, `chunk_size`, `n_solver_steps`, `regression_coef`, `timestep_embedding`, `calm_units` and
+        `return_conditioning` where they are not given, see :mod:`sb3_dtfm.data.decisions`
     :param stats_window_size: as in SB3; offline learning collects no episodes
     :param tensorboard_log: folder of the TensorBoard log, None for no log
     :param verbose: 0 silent, 1 prints the log
@@ -224,8 +224,10 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         given = self.policy_kwargs or {}
         names = self._policy_class.parameter_names() - set(given)
         names |= {name for name in DECIDED if getattr(self, name) is None}
-        if TRAINED_BY & set(given):  # which belong together
-            names -= TRAINED_BY
+        if given.get("n_solver_steps") == 0:  # the mean action, which a regression learns
+            names.discard("regression_coef")
+        if given.get("regression_coef") == 0 or given.get("critic_steps"):  # no mean action; a choice among draws
+            names.discard("n_solver_steps")
         self.decisions = [each for each in decide(buffer) if each.name in names]
         values = {each.name: each.value for each in self.decisions}
         for name in DECIDED & set(values):

@@ -16,8 +16,6 @@ from sb3_dtfm.files import read_run
 
 # Below this share of the goal there is something to try.
 ENOUGH = 0.9
-# Fewer recorded episodes than this may be overfitted.
-FEW_EPISODES = 50
 N_RANDOM_EPISODES = 5
 
 
@@ -126,8 +124,6 @@ def compare(
     if share is not None and share < ENOUGH:
         n_steps = attributes["_total_timesteps"]
         sentences.append(f"Longer training may help: -n {2 * n_steps} instead of {n_steps}.")
-        if reference.n_episodes < FEW_EPISODES and not policy_kwargs.get("dropout"):
-            sentences.append(f"Dropout may help to learn from {reference.n_episodes} episodes: -params dropout:0.1")
         if target is not None:
             dataset = read_run(run / env_name).get("dataset")
             arguments = f"--env {env_name.gym_id} --dataset {dataset if isinstance(dataset, str) else 'DATASET'}"

@@ -88,8 +88,7 @@ def test_few_steps_of_many_dimensions_are_not_learned_by_heart():
     assert settings(make_buffer("agent", 10, 80))["dropout"] == 0.0
 
 
-def test_what_a_user_gives_counts_and_its_counterpart_is_not_decided():
-    """The mean action needs a regression, which plans would leave out."""
+def test_what_a_user_gives_counts():
     buffer = make_buffer("planner")
     given = DTFM("MultiInputPolicy", dataset=buffer, batch_size=32, policy_kwargs={"n_solver_steps": 0}, device="cpu")
     assert (given.batch_size, given.policy.acting_settings()["n_solver_steps"], given.policy.chunk_size) == (32, 0, 8)
@@ -97,8 +96,20 @@ def test_what_a_user_gives_counts_and_its_counterpart_is_not_decided():
     assert (decided.batch_size, decided.policy.acting_settings()["n_solver_steps"], decided.policy.chunk_size) == (64, 10, 8)
 
 
+def test_what_is_decided_goes_with_what_a_user_gives():
+    def loss_and_steps(kind: str, **policy_kwargs) -> tuple:
+        model = DTFM("MultiInputPolicy", dataset=make_buffer(kind), policy_kwargs=policy_kwargs, device="cpu")
+        return model.policy.network.head.regression_coef, model.policy.network.head.n_solver_steps
+
+    assert loss_and_steps("planner", n_solver_steps=5) == (0.0, 5)
+    assert loss_and_steps("planner", n_solver_steps=0) == (1.0, 0)
+    assert loss_and_steps("agent", n_solver_steps=5) == (1.0, 5)
+    assert loss_and_steps("agent", regression_coef=0.0) == (0.0, 10)
+    assert loss_and_steps("agent", critic_steps=1, n_candidates=4) == (1.0, 10), "a critic chooses among draws"
+
+
 def test_people_are_told_each_reason_once():
     told = sentences(decide(make_buffer("planner")))
-    assert told[0] == "There are few recorded steps (800). So batch_size=64."
+    assert told[0] == "There are 800 recorded steps, fewer than 10,000. So batch_size=64."
     assert sum("chunk_size=8" in sentence for sentence in told) == 1
     assert len(told) == 4
