@@ -38,7 +38,7 @@ def _is_mapping(value: Any) -> bool:
 
 
 def _is_share(value: Any) -> bool:
-    return isinstance(value, float | int) and 0.0 < value <= 1.0
+    return type(value) in (float, int) and 0.0 < value <= 1.0
 
 
 # Keys of an entry of the file of --datasets: what is accepted, and whether a value is.

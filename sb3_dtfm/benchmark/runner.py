@@ -156,7 +156,7 @@ class Runner:
         return process
 
     def _train_command(self, job: Job, folder: Path) -> list[str]:
-        """`sb3-dtfm train` of a cell, which goes on where it left a checkpoint."""
+        """`sb3-dtfm train` of a cell, which resumes from its checkpoint if it left one."""
         command = [*TRAIN, "--algo", job.cell.algo, "--env", job.task.env_id, "--seed", str(job.cell.seed)]
         command += ["--conf-file", str(folder / SETTINGS), "--log-folder", str(folder / LOGS), "--eval-freq", "-1"]
         command += ["--verbose", "0", "--device", self.options.device, "--num-threads", str(self._n_threads)]

@@ -13,8 +13,6 @@ N_TIMESTEPS, BATCH_SIZE, LEARNING_RATE, WEIGHT_DECAY = 3000, 256, 1e-3, 1e-2
 N_AT_ONCE = 8192
 # 0.5 would be the mean, and near 1 the luckiest: what noise spoiled often, a model that leaves it out does often.
 EXPECTILE = 0.95
-# Standard deviations at which observations are clipped, and what is smaller than this is a constant.
-CLIP, SMALLEST_STD = 10.0, 1e-6
 
 
 class Steps(NamedTuple):
@@ -70,14 +68,12 @@ def _regression(steps: Steps, statistics: Statistics, seed: int) -> th.Tensor:
     :param seed: of weights and batches
     :return: (M,) float32
     """
-    mean, std = (th.as_tensor(each, dtype=th.float32) for each in (statistics.observation_mean, statistics.observation_std))
-    std = th.where(std > SMALLEST_STD, std, 1.0)
     scale = statistics.return_scale or 1.0
     elapsed = steps.timesteps.unsqueeze(1) / (int(steps.timesteps.max()) + 1)
 
     def expected(chosen: th.Tensor) -> th.Tensor:
         """Two numbers by observation and time: a return, and one that shrinks with the steps that are left, as a gait's."""
-        observations = ((steps.observations.index_select(0, steps.rows[chosen]) - mean) / std).clamp(-CLIP, CLIP)
+        observations = statistics.normalize(steps.observations.index_select(0, steps.rows[chosen]))
         fixed, shrinking = network(th.cat((observations, elapsed[chosen]), dim=1)).unbind(1)
         return fixed + shrinking * (1.0 - elapsed[chosen, 0])
 

@@ -1,4 +1,4 @@
-"""How well actions are predicted by what is seen, by what was done before, and by how the episode turns out."""
+"""How well actions are predicted by the observation, by the previous action, and by the observation and the return."""
 
 from typing import NamedTuple
 
@@ -8,12 +8,11 @@ import torch as th
 from sb3_dtfm.actions import bounds_of, vector_space
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 
-# Parts that are held out in turn, and most steps of all of them.
+# Folds of the cross-validation, and the most steps of all of them.
 N_PARTS, MAX_STEPS = 5, 16_384
-# Of the ridge regressions, penalties as shares of the products' mean.
+# Random features, and ridge penalties as shares of the mean diagonal of X^T X.
 N_FEATURES, PENALTIES = 256, (1e-3, 1e-1, 10.0)
-CLIP, SMALLEST_STD = 10.0, 1e-6
-# Standard deviation of returns, as a share of the largest, that becomes 1; smaller ones stay small.
+# Returns are divided by their standard deviation, but by no less than this share of the largest absolute one.
 SMALLEST_SPREAD = 1e-3
 
 
@@ -61,9 +60,9 @@ def prediction_errors(buffer: TrajectoryBuffer) -> PredictionErrors | None:
     names, episode = np.unique(episode, return_inverse=True)
     if len(names) < 2:
         return None
-    rows = buffer.rows.cpu()[chosen]
+    rows = buffer.rows[chosen.to(buffer.rows.device)]
     low, high = (th.as_tensor(bound).double() for bound in bounds_of(vector_space(buffer.action_space)))
-    previous, actions = (buffer.actions.cpu()[at].double() / (high - low) for at in (rows - 1, rows))
+    previous, actions = (buffer.actions.index_select(0, at).cpu().double() / (high - low) for at in (rows - 1, rows))
     features = _features(buffer, rows, buffer.episode_returns[names][episode], generator)
     part = np.random.default_rng(0).permutation(len(names))[episode] % N_PARTS
 
@@ -79,25 +78,25 @@ def _features(
     buffer: TrajectoryBuffer, rows: th.Tensor, returns: np.ndarray, generator: th.Generator
 ) -> tuple[th.Tensor, th.Tensor]:
     """
-    What to regress on: the observation, random features of it, and these again, as they are or moved by the return.
+    Regressors without and with the return: the observation, and random features of it alone and of it with the return.
 
     :param rows: (N,) of the buffer's tensors
     :param returns: (N,) of whole episodes
-    :return: without and with the return, (N, F) each
+    :return: (N, F) each; without the return it counts as the mean one, so that both have the same number of features
     """
-    mean, std = (th.as_tensor(each).float() for each in buffer.statistics()[:2])
-    seen = ((buffer.observations.cpu()[rows] - mean) / th.where(std > SMALLEST_STD, std, 1.0)).clamp(-CLIP, CLIP)
-    weight = 2.0 * th.randn(seen.shape[1], N_FEATURES, generator=generator) / seen.shape[1] ** 0.5
-    mapped = seen @ weight + th.randn(N_FEATURES, generator=generator)
-    unit = max(float(returns.std()), SMALLEST_SPREAD * float(np.abs(returns).max()), SMALLEST_STD)
-    told = th.from_numpy((returns - returns.mean()) / unit).float().unsqueeze(1)
-    by_return = th.randn(N_FEATURES, generator=generator)
+    observations = buffer.statistics().normalize(buffer.observations.index_select(0, rows).cpu())
+    weights = 2.0 * th.randn(observations.shape[1], N_FEATURES, generator=generator) / observations.shape[1] ** 0.5
+    projected = observations @ weights + th.randn(N_FEATURES, generator=generator)
+    return_weights = th.randn(N_FEATURES, generator=generator)
+    unit = max(float(returns.std()), SMALLEST_SPREAD * float(np.abs(returns).max())) or 1.0
+    normalized = th.from_numpy((returns - returns.mean()) / unit).float().unsqueeze(1)
 
-    def with_return(told: th.Tensor) -> th.Tensor:
-        moved = (mapped + told * by_return).relu()
-        return th.cat((seen, told, mapped.relu(), moved, th.ones_like(told)), dim=1).double()
+    def features(of_return: th.Tensor) -> th.Tensor:
+        with_return = projected + of_return * return_weights
+        ones = th.ones_like(of_return)
+        return th.cat((observations, of_return, projected.relu(), with_return.relu(), ones), dim=1).double()
 
-    return with_return(th.zeros_like(told)), with_return(told)
+    return features(th.zeros_like(normalized)), features(normalized)
 
 
 def _held_out(features: th.Tensor, actions: th.Tensor, part: np.ndarray) -> list[th.Tensor]:
@@ -109,13 +108,14 @@ def _held_out(features: th.Tensor, actions: th.Tensor, part: np.ndarray) -> list
     :param part: (N,) which each step belongs to
     :return: (N, A) for each penalty
     """
-    predicted = [th.zeros_like(actions) for _ in PENALTIES]
-    offset = actions.mean(dim=0)
-    products, shares = features.T @ features, features.T @ (actions - offset)
-    for held in (th.from_numpy(part == number) for number in range(N_PARTS)):
-        mine, wanted = features[held], actions[held] - offset
-        others, share = products - mine.T @ mine, shares - mine.T @ wanted
-        unit = others.diagonal().mean() * th.eye(len(others), dtype=others.dtype)
-        for penalty, each in zip(PENALTIES, predicted, strict=True):
-            each[held] = mine @ th.cholesky_solve(share, th.linalg.cholesky(others + penalty * unit)) + offset
-    return predicted
+    predictions = [th.zeros_like(actions) for _ in PENALTIES]
+    mean = actions.mean(dim=0)
+    products, targets = features.T @ features, features.T @ (actions - mean)
+    for held_out in (th.from_numpy(part == number) for number in range(N_PARTS)):
+        x, y = features[held_out], actions[held_out] - mean
+        training_products, training_targets = products - x.T @ x, targets - x.T @ y  # of the other parts
+        unit = training_products.diagonal().mean() * th.eye(len(products), dtype=products.dtype)
+        for penalty, prediction in zip(PENALTIES, predictions, strict=True):
+            factor = th.linalg.cholesky(training_products + penalty * unit)
+            prediction[held_out] = x @ th.cholesky_solve(training_targets, factor) + mean
+    return predictions

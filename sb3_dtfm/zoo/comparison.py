@@ -1,4 +1,4 @@
-"""The returns of a model beside its target return and the recorded returns, as `train` and `enjoy` end by printing."""
+"""Compare a model's returns with its target return and the recorded returns: printed at the end of `train` and `enjoy`."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ from sb3_dtfm.data import ReturnReference
 from sb3_dtfm.envs.success import reported_success
 from sb3_dtfm.files import read_run
 
-# Below this share of the goal there is something to try.
+# Below this share of the goal, suggestions are printed.
 ENOUGH = 0.9
 N_RANDOM_EPISODES = 5
 
@@ -94,8 +94,8 @@ def compare(
     """
     Compare a model's episodes with its target return and the recorded episodes, see :meth:`ReturnReference.goal`.
 
-    Where they reach less than nine tenths of the goal, things to try follow: longer training, dropout for few episodes, and
-    a sweep where the model looks at a target return.
+    Where they reach less than nine tenths of the goal, suggestions follow: longer training, and a sweep where the model
+    looks at a target return.
 
     :param attributes: of the model, or of its file; `target_return` is that of these episodes
     :param returns: of its episodes, environment reward units
