@@ -23,7 +23,6 @@ from sb3_dtfm.actions import vector_space
 from sb3_dtfm.benchmark.evaluation import EvaluationCallback
 from sb3_dtfm.benchmark.provenance import read_data
 from sb3_dtfm.data import TrajectoryBuffer
-from sb3_dtfm.policies.normalization import Normalization
 from sb3_dtfm.zoo.arguments import import_packages
 
 
@@ -46,12 +45,12 @@ class Cloning:
         self.num_timesteps, self._total_timesteps = 0, 0
         self.buffer, self.action_space = buffer, buffer.action_space
         self._generator = th.Generator().manual_seed(seed)
-        n_inputs, space = int(buffer.observation_space.shape[0]), vector_space(self.action_space)
-        self.normalization = Normalization(n_inputs, space, 1, clip_return_to_go=False, return_scaling=None)
-        self.normalization.set_statistics(*buffer.statistics())
-        sizes = [n_inputs, *hidden_sizes]
+        box = vector_space(self.action_space)
+        self._low, self._high = th.as_tensor(box.low), th.as_tensor(box.high)
+        self._statistics = buffer.statistics()
+        sizes = [len(self._statistics.observation_mean), *hidden_sizes]
         hidden = [layer for n_in, n_out in pairwise(sizes) for layer in (nn.Linear(n_in, n_out), nn.ReLU())]
-        self.policy = nn.Sequential(*hidden, nn.Linear(sizes[-1], int(space.shape[0])))
+        self.policy = nn.Sequential(*hidden, nn.Linear(sizes[-1], len(self._low)))
         self._optimizer = th.optim.Adam(self.policy.parameters(), learning_rate, fused=True)
 
     def learn(self, n_steps: int, batch_size: int, callback: BaseCallback) -> None:
@@ -78,10 +77,11 @@ class Cloning:
         output, actions = self._output(batch.observations[:, 0]), batch.actions[:, 0]
         if isinstance(self.action_space, spaces.Discrete):
             return nn.functional.cross_entropy(output, actions)
-        return (output - self.normalization.scale_action(actions)).square().mean()
+        scaled = 2.0 * (actions - self._low) / (self._high - self._low) - 1.0
+        return (output - scaled).square().mean()
 
     def _output(self, observations: th.Tensor) -> th.Tensor:
-        return self.policy(self.normalization.scale_observation(observations))
+        return self.policy(self._statistics.normalize(observations))
 
     def predict(self, observation: dict[str, np.ndarray], *_: Any, **__: Any) -> tuple[np.ndarray, None]:
         """Actions as Stable-Baselines3's models give them."""
@@ -89,7 +89,8 @@ class Cloning:
             output = self._output(th.as_tensor(observation["observation"]))
         if isinstance(self.action_space, spaces.Discrete):
             return self.action_space.start + output.argmax(dim=1).numpy(), None
-        return self.normalization.unscale_action(output).numpy().astype(self.action_space.dtype), None
+        actions = self._low + 0.5 * (output.clamp(-1.0, 1.0) + 1.0) * (self._high - self._low)
+        return actions.numpy().astype(self.action_space.dtype), None
 
 
 def main(argv: Sequence[str] | None = None) -> None:
