@@ -111,6 +111,10 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     float64 and shown as float32, in environment reward units; scaling is the policy's business. A Dict observation
     (goal-conditioned tasks, for example) is flattened to one vector, see :func:`flatten_observation_space`.
 
+    An episode that is ahead of its target keeps the target's pace: in an environment with a time limit of T steps it is
+    shown at least target (1 - t / T). Otherwise a policy that leaves out its recordings' noise, and so returns more, is
+    asked for less and less, and goes on as a worse agent did.
+
     `step` also takes several actions, (N, A): they are carried out one after the other until the episode ends, rewards are
     added up, and `info` has the observations between them, stacked by key, under `BETWEEN`. So whoever decides once for
     several steps does so in each of many parallel environments at its own place in its episode.
@@ -121,16 +125,18 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     :param env: the environment to wrap
     :param target_return: return to ask for in each episode, environment reward units; None takes that of the model which the
         environment is given to
+    :param keep_pace: keep the target's pace; False shows the target less the rewards, as Decision Transformer does
     :raises ValueError: `target_return` is not a finite number, or the observation space cannot be flattened
     """
 
-    def __init__(self, env: gym.Env, target_return: float | None = None) -> None:
-        RecordConstructorArgs.__init__(self, target_return=target_return)
+    def __init__(self, env: gym.Env, target_return: float | None = None, keep_pace: bool = True) -> None:
+        RecordConstructorArgs.__init__(self, target_return=target_return, keep_pace=keep_pace)
         super().__init__(env)
+        self._time_limit = env.spec.max_episode_steps if keep_pace and env.spec is not None else None
         self.target_return = None if target_return is None else check_target_return(target_return)
         self.observation_space = return_to_go_space(env.observation_space)
         self._sorted_space = sort_observation_space(env.observation_space)
-        self._return_to_go = math.nan
+        self._episode_target = self._return_to_go = math.nan
         self._timestep = 0
 
     @property
@@ -159,7 +165,7 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                 "model.set_env(env), or write ReturnToGoWrapper(env, target_return=model.target_return)."
             )
         observation, info = self.env.reset(seed=seed, options=options)
-        self._return_to_go = self.target_return
+        self._episode_target = self._return_to_go = self.target_return
         self._timestep = 0
         return self._observe(observation), info
 
@@ -189,9 +195,12 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return last, total, terminated, truncated, info
 
     def _observe(self, observation: Any) -> dict[str, np.ndarray]:
+        return_to_go = self._return_to_go
+        if self._time_limit is not None:
+            return_to_go = max(return_to_go, self._episode_target * (1.0 - self._timestep / self._time_limit))
         return {
             OBSERVATION: np.asarray(spaces.flatten(self._sorted_space, observation)).astype(np.float32),
-            RETURN_TO_GO: np.array([self._return_to_go], dtype=np.float32),
+            RETURN_TO_GO: np.array([return_to_go], dtype=np.float32),
             TIMESTEP: np.array([self._timestep], dtype=np.int64),
         }
 

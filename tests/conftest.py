@@ -36,7 +36,9 @@ TINY_FLOW_POLICY = dict(
     one_step=True,
 )
 # Constant learning rate and the newest weights: what a few gradient steps change shows at once.
-PLAIN = dict(learning_rate=1e-4, learning_rate_schedule="constant", warmup_steps=0, ema_decay=0.0, return_weight=0.0)
+PLAIN = dict(
+    learning_rate=1e-4, learning_rate_schedule="constant", warmup_steps=0, ema_decay=0.0, return_weight=0.0, return_steps=0
+)
 EPISODE_LENGTH = 30
 
 

@@ -62,7 +62,7 @@ ACCEPTED: dict[str, Rule] = {
     "dataset_seed": Number(low=0, whole=True),
     "timestep_exponent": POSITIVE,
     "return_weight": NOT_NEGATIVE._replace(optional=True),
-    "return_steps": Number(low=1, whole=True, optional=True),
+    "return_steps": Number(low=0, whole=True, optional=True),
     "max_grad_norm": NOT_NEGATIVE._replace(optional=True),
     "warmup_steps": Number(low=0, whole=True),
     "learning_rate_schedule": Choice(LEARNING_RATE_SCHEDULES),
@@ -73,7 +73,7 @@ ACCEPTED: dict[str, Rule] = {
     "target_return": Number(optional=True),
 }
 # Arguments of the algorithm that the data decide where they are None; the policy's are among `policy_kwargs`.
-DECIDED = {"batch_size", "return_weight"}
+DECIDED = {"batch_size", "return_weight", "return_steps"}
 
 
 class OfflineAlgorithm(BaseAlgorithm, ABC):
@@ -99,7 +99,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         worst, and others by their returns in between (Yue et al., 2022); 0 learns from all alike. By default 5 where
         returns tell how episodes act, and 0 elsewhere
     :param return_steps: n: a step's return-to-go is the rewards of n steps and what may be expected after such an
-        observation, so that asking for the best does not ask for luck (Paster et al., 2022); None takes what was recorded
+        observation, so that asking for the best does not ask for luck (Paster et al., 2022); 0 takes what was recorded. By
+        default 50 where returns tell how episodes act and no number makes up half of the rewards, and 0 elsewhere
     :param dataset_kwargs: further arguments of :func:`~sb3_dtfm.data.load_dataset`: `{"cache_dir": folder}` for datasets
         larger than memory, `{"env_id": id}` for data that were recorded under another environment's name, and the
         reader's own, for example `{"filter_key": "train"}` for robomimic. `max_episode_steps` is the environment's unless
@@ -185,7 +186,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         self.dataset_seed = dataset_seed
         self.timestep_exponent = timestep_exponent
         self.return_weight: float = return_weight  # type: ignore[assignment]  # as batch_size
-        self.return_steps = return_steps
+        self.return_steps: int = return_steps  # type: ignore[assignment]  # as batch_size
         self.dataset_kwargs = dataset_kwargs
         self.max_grad_norm = max_grad_norm
         self.warmup_steps = warmup_steps
@@ -205,17 +206,18 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         self._training_seed: int | None = None  # where `seed` is None
         if _init_setup_model:
             self._check_arguments(learning_rate=POSITIVE)
-            buffer = self._load_buffer()
+            buffer = self._read_dataset()
             self.max_timestep = int(buffer.episode_lengths.max())
             self._decide(buffer)
+            taken = self._take(buffer)
             self.score_reference = buffer.score_reference
             self._setup_model()
             normalization = self.policy.normalization
             normalization.set_statistics(*buffer.statistics())
             if normalization.return_mean is not None:
-                normalization.set_return_to_go_moments(buffer.return_to_go_moments())
+                normalization.set_return_to_go_moments(taken.return_to_go_moments())
             if normalization.return_to_go_range is not None:
-                normalization.set_return_to_go_range(buffer.return_to_go_range())
+                normalization.set_return_to_go_range(taken.return_to_go_range())
             if self.policy.critic is not None:
                 self.policy.critic.set_scale(buffer.largest_discounted_return(self.policy.gamma))
 
@@ -226,6 +228,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         names |= {name for name in DECIDED if getattr(self, name) is None}
         if given.get("n_solver_steps") == 0:  # the mean action, which a regression learns
             names.discard("regression_coef")
+        if given.get("return_conditioning") is False:
+            names.discard("return_steps")
         if given.get("regression_coef") == 0 or given.get("critic_steps"):  # no mean action; a choice among draws
             names.discard("n_solver_steps")
         self.decisions = [each for each in decide(buffer) if each.name in names]
@@ -265,6 +269,10 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         self._load_buffer()
 
     def _load_buffer(self) -> TrajectoryBuffer:
+        """The dataset of a model whose settings stand, as it is learned from."""
+        return self._take(self._read_dataset())
+
+    def _read_dataset(self) -> TrajectoryBuffer:
         """Read the dataset and check it against the spaces, which it defines where there is no environment."""
         if self.dataset is None:
             name = type(self).__name__
@@ -286,11 +294,19 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         buffer = buffer.random_fraction(self.dataset_fraction, self.dataset_seed)
         if self.target_return is None:
             self._take_target_return(suggested_target_return(buffer))
-        if self.return_steps is not None:
+        self.return_reference = return_reference(buffer)
+        return buffer
+
+    def _take(self, buffer: TrajectoryBuffer) -> TrajectoryBuffer:
+        """
+        Learn from these episodes from now on.
+
+        :return: them, with the returns-to-go that the model is conditioned on
+        """
+        if self.return_steps:
             if self.verbose >= 1 and is_first_process():
                 print(f"Learning which returns may be expected (return_steps={self.return_steps})", flush=True)
             buffer = buffer.to("cpu").with_expected_returns(self.return_steps, self.dataset_seed)
-        self.return_reference = return_reference(buffer)
         self.buffer = buffer.to(self.device)
         return self.buffer
 

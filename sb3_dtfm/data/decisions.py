@@ -13,6 +13,8 @@ CHUNK_SIZE = 8
 FLOW_STEPS = 10
 # w: a step of the best episode is learned from 1 + w times as often as one of the worst.
 RETURN_WEIGHT = 5.0
+# Steps after which a return-to-go counts what may be expected instead of what was recorded.
+RETURN_STEPS = 50
 # Standard errors by which knowing an episode's return has to make actions more predictable.
 SIGNIFICANT = 2.0
 # Recorded steps below which batches are small.
@@ -41,6 +43,8 @@ def decide(buffer: TrajectoryBuffer) -> list[Decision]:
     """
     errors = prediction_errors(buffer)
     decisions = [_batch_size(buffer), _dropout(buffer), *_by_return(errors)]
+    if decisions[-1].value:  # returns tell
+        decisions.append(_return_steps(buffer))
     if isinstance(buffer.action_space, spaces.Box):
         decisions += _kind_of_actor(errors)
     return decisions
@@ -89,6 +93,20 @@ def _by_return(errors: PredictionErrors | None) -> list[Decision]:
         Decision("return_conditioning", tells, reason),
         Decision("return_weight", RETURN_WEIGHT if tells else 0.0, reason),
     ]
+
+
+def _return_steps(buffer: TrajectoryBuffer) -> Decision:
+    """
+    Whether a step's return-to-go counts what may be expected instead of what was recorded.
+
+    With 50 steps three mediocre cheetahs with noise return 4,760 and 4,383 (two seeds) instead of 4,080. Where a reward only
+    tells of success, everything may be expected from everywhere: a maze of random walks is solved in 1 % instead of 27 %.
+    """
+    rewards = buffer.rewards[buffer.rows]
+    n_equal = int((rewards == rewards.mode().values).sum())
+    varies = 2 * n_equal < len(rewards)
+    reason = f"{n_equal / len(rewards):.0%} of the rewards are the same number."
+    return Decision("return_steps", RETURN_STEPS if varies else 0, reason)
 
 
 def _kind_of_actor(errors: PredictionErrors | None) -> list[Decision]:

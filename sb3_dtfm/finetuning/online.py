@@ -256,7 +256,7 @@ class OnlineDTFM(DTFM):
         successes, returns = self.replay_buffer.successes, self.replay_buffer.episode_returns
         worthy = np.flatnonzero(np.where(np.isnan(successes), returns >= average, successes == 1.0))
         imitated = self.replay_buffer.select(worthy) if len(worthy) else None
-        if imitated is not None and self.return_steps is not None:
+        if imitated is not None and self.return_steps:
             imitated = imitated.to("cpu").with_expected_returns(self.return_steps, self.dataset_seed).to(self.device)
         n_own = self._n_own(imitated, self.batch_size) if imitated is not None else 0
         streams = [self._batches(self.buffer, self.batch_size - n_own)] if n_own < self.batch_size else []

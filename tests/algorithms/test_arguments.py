@@ -23,7 +23,7 @@ REFUSED = {
     "dataset_fraction": (0, 1.5, NAN),
     "timestep_exponent": (0, -1.0, float("inf"), NAN),
     "return_weight": (-1.0, float("inf"), NAN),
-    "return_steps": (0, -1, 2.5),
+    "return_steps": (-1, 2.5),
     "precision": ("float8",),
     "learning_rate_schedule": ("step",),
     "compile": ("yes", 1),

@@ -66,10 +66,16 @@ def test_too_little_to_tell_is_taken_for_an_agents(n_episodes, n_steps):
     assert any("too few episodes" in sentence for sentence in sentences(decide(buffer)))
 
 
-@pytest.mark.parametrize(("kind", "expected"), [("ladder", (True, 5.0)), ("agent", (False, 0.0))])
+@pytest.mark.parametrize(("kind", "expected"), [("ladder", (True, 5.0, 50)), ("agent", (False, 0.0, None))])
 def test_returns_count_where_they_tell_how_an_episode_acts(kind, expected):
     decided = settings(make_buffer(kind))
-    assert (decided["return_conditioning"], decided["return_weight"]) == expected
+    assert tuple(decided.get(name) for name in ("return_conditioning", "return_weight", "return_steps")) == expected
+
+
+def test_returns_are_not_expected_where_a_reward_tells_of_success_alone():
+    buffer = make_buffer("ladder")
+    buffer.rewards[buffer.timesteps < 39] = 0.0
+    assert settings(buffer)["return_steps"] == 0
 
 
 def test_returns_that_are_all_alike_tell_nothing():

@@ -109,6 +109,7 @@ def test_the_papers_settings():
         "weight_decay": 1e-3,
         "ema_decay": 0.0,
         "return_weight": 0.0,
+        "return_steps": 0,
         "precision": "auto",
     }
 
