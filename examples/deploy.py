@@ -37,7 +37,7 @@ class Policy:
         The next action, as `predict(deterministic=True)` chooses it; time step 0 begins an episode.
 
         :param observation: (O,)
-        :param return_to_go: target return less the rewards so far
+        :param return_to_go: target return less the rewards so far, or more where an episode is ahead of it
         :param timestep: counted from the episode's start
         :return: (A,) in the environment's range, or a number where its action space is Discrete
         """
@@ -77,12 +77,14 @@ def main() -> None:
     if env_id is None or target is None:
         parser.error("the file does not say for which task it is: give --env and --target-return")
     env = gymnasium.make(env_id)
+    time_limit = env.spec.max_episode_steps
     for episode in range(options.episodes):
         observation, info = env.reset(seed=options.seed + episode)
         return_to_go, timestep, done, milliseconds = target, 0, False, []
         while not done:
             start = time.perf_counter()
-            action = policy.act(observation, return_to_go, timestep)
+            pace = target * (1 - timestep / time_limit) if time_limit else -np.inf  # of an episode ahead of its target
+            action = policy.act(observation, max(return_to_go, pace), timestep)
             milliseconds.append((time.perf_counter() - start) * 1e3)
             observation, reward, terminated, truncated, info = env.step(action)
             return_to_go, timestep, done = return_to_go - float(reward), timestep + 1, terminated or truncated

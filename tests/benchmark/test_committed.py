@@ -12,7 +12,7 @@ from sb3_dtfm.cli.main import main
 ROOT = Path(__file__).parents[2]
 # Where a report lies, and of what it is; results/README.md has the commands.
 STUDIES = ("time-steps", "windows/*_uniform-windows.jsonl", "paused", "mixed", "few", "noisy", "two-ways", "styles")
-REPORTS = {"docs": ("grid/*_small.jsonl",), "docs/studies": STUDIES}
+REPORTS = {"docs": ("suite",), "docs/studies": STUDIES}
 
 
 def test_the_suite_of_data_sets_is_what_the_benchmark_reads(monkeypatch):

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
 
 from sb3_dtfm import DTFM
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.data.decisions import decide, sentences
-from sb3_dtfm.data.predictability import prediction_errors
+from sb3_dtfm.data.predictability import correlation_of_changes, prediction_errors
 
 SPACE = spaces.Box(-1.0, 1.0, (2,))
 
@@ -48,6 +49,14 @@ def test_a_planners_actions_are_drawn_in_chunks():
     decided = settings(buffer)
     assert (decided["chunk_size"], decided["n_solver_steps"], decided["regression_coef"]) == (8, 10, 0.0)
     assert decided["timestep_embedding"]
+    assert not decided["calm_units"]
+
+
+def test_a_planners_noise_takes_robust_units():
+    buffer = make_buffer("planner")
+    buffer.actions += 0.1 * th.randn(buffer.actions.shape, generator=th.Generator().manual_seed(0))
+    decided = settings(buffer)
+    assert (decided["chunk_size"], decided["calm_units"], decided["dropout"]) == (8, True, 0.0)
 
 
 def test_a_decision_repeats_and_leaves_the_data_alone():
@@ -89,9 +98,19 @@ def test_few_steps_make_small_batches():
     assert settings(make_buffer("agent", 20, 500))["batch_size"] == 256
 
 
-def test_few_steps_of_many_dimensions_are_not_learned_by_heart():
+def test_the_noise_of_few_steps_is_not_learned_by_heart():
     assert settings(make_buffer("agent", 10, 70))["dropout"] == 0.2
     assert settings(make_buffer("agent", 10, 80))["dropout"] == 0.0
+    assert settings(make_buffer("planner", 10, 70))["dropout"] == 0.0
+
+
+def test_white_noise_takes_back_half_of_what_it_did():
+    assert correlation_of_changes(make_buffer("agent", 20, 200)) == pytest.approx(-0.5, abs=0.05)
+    assert correlation_of_changes(make_buffer("planner", 20, 200)) == pytest.approx(0.0, abs=0.05)
+    still = make_buffer("agent")
+    still.actions[:] = 0.5
+    assert correlation_of_changes(still) == 0.0
+    assert correlation_of_changes(make_buffer("agent", 5, 2)) == 0.0
 
 
 def test_what_a_user_gives_counts():
@@ -118,4 +137,4 @@ def test_people_are_told_each_reason_once():
     told = sentences(decide(make_buffer("planner")))
     assert told[0] == "There are 800 recorded steps, fewer than 10,000. So batch_size=64."
     assert sum("chunk_size=8" in sentence for sentence in told) == 1
-    assert len(told) == 4
+    assert len(told) == 5

@@ -90,6 +90,8 @@ def _group(group: Group, figures: Mapping[str, str]) -> list[str]:
         return [f"![{title}]({figures[kind]})", "", caption, ""] if kind in figures else []
 
     parts = [*show("scores", "scores by data set", SCORES_CAPTION), *_compact(group), ""] if group.has_baselines else []
+    if parts and "curves" not in figures:  # many data sets, of which the final evaluations count
+        return [*parts, *_time(group), "", *_sources(group), ""]
     parts += [*show("curves", "learning curves", CAPTION), *_achieved(group), "", *_intervals(group), ""]
     if group.success_tasks:
         parts += [*show("solved", "episodes solved by environment step", SOLVED_CAPTION), *_steps(group), ""]
@@ -105,8 +107,9 @@ def _compact(group: Group) -> list[str]:
     for name, task, regime in group.data_sets:
         runs = [group.of(task, regime, algo) for algo in algos]
         reached = [_reached(each) if each else NOT_RUN for each in runs]
-        rows.append([_escape(name), _recorded(next(each for each in runs if each)[0]), *reached])
-    return [COMPACT_TEXT, "", *_table(["data set", "recorded; best tenth", *map(full_name, algos)], rows)]
+        seeds = [str(len(each)) for each in runs]
+        rows.append([_escape(name), _recorded(next(each for each in runs if each)[0]), *reached, "; ".join(seeds)])
+    return [COMPACT_TEXT, "", *_table(["data set", "recorded; best tenth", *map(full_name, algos), "seeds"], rows)]
 
 
 def _reached(runs: Sequence[Run]) -> str:
