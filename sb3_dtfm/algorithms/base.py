@@ -60,7 +60,6 @@ ACCEPTED: dict[str, Rule] = {
     "context_length": Number(low=1, high=100_000, whole=True),
     "dataset_fraction": Number(low=0, high=1, above_low=True),
     "dataset_seed": Number(low=0, whole=True),
-    "timestep_exponent": POSITIVE,
     "return_weight": NOT_NEGATIVE._replace(optional=True),
     "return_steps": Number(low=0, whole=True, optional=True),
     "max_grad_norm": NOT_NEGATIVE._replace(optional=True),
@@ -93,8 +92,6 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
     :param context_length: K, steps the policy sees
     :param dataset_fraction: share of the episodes to learn from, randomly drawn
     :param dataset_seed: seed of that draw alone, so that different runs learn from the same episodes
-    :param timestep_exponent: e of the time step T u^e at which windows end in an episode of T steps, for u uniform in
-        [0, 1]: above 1 an episode's start, of which there is little in long episodes, is learned from more often
     :param return_weight: w: of mixed data, a step of the best episode is learned from 1 + w times as often as one of the
         worst, and others by their returns in between (Yue et al., 2022); 0 learns from all alike. By default 5 where
         returns tell how episodes act, and 0 elsewhere
@@ -143,7 +140,6 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         context_length: int = 1,
         dataset_fraction: float = 1.0,
         dataset_seed: int = 0,
-        timestep_exponent: float = 1.0,
         return_weight: float | None = None,
         return_steps: int | None = None,
         dataset_kwargs: dict[str, Any] | None = None,
@@ -184,7 +180,6 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         self.context_length = context_length
         self.dataset_fraction = dataset_fraction
         self.dataset_seed = dataset_seed
-        self.timestep_exponent = timestep_exponent
         self.return_weight: float = return_weight  # type: ignore[assignment]  # as batch_size
         self.return_steps: int = return_steps  # type: ignore[assignment]  # as batch_size
         self.dataset_kwargs = dataset_kwargs

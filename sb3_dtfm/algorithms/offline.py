@@ -166,7 +166,6 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
             batch_size,
             self.context_length,
             th.Generator(self.device),
-            self.timestep_exponent,
             n_ahead=self.policy.chunk_size - 1,
             return_weight=self.return_weight,
             seeds=seeds,

@@ -93,7 +93,6 @@ class FlatSteps:
         batch_size: int,
         context_length: int,
         generator: th.Generator,
-        timestep_exponent: float = 1.0,
         n_ahead: int = 0,
         return_weight: float = 0.0,
         seeds: Iterable[int] | None = None,
@@ -106,8 +105,6 @@ class FlatSteps:
         :param batch_size: B
         :param context_length: K
         :param generator: source of randomness, of nothing else: it is a batch ahead
-        :param timestep_exponent: e of the time step T u^e in an episode of T steps, for u uniform in [0, 1]; 1 draws any
-            step of any episode with equal probability
         :param n_ahead: see :meth:`windows`
         :param return_weight: w: a step of an episode of return R is drawn 1 + w (R - Rmin) / (Rmax - Rmin) times as often as
             one of the worst episode (Yue et al., 2022)
@@ -121,7 +118,7 @@ class FlatSteps:
             for seed in itertools.repeat(None) if seeds is None else seeds:
                 if seed is not None:
                     generator.manual_seed(seed)
-                drawn = self._draw(batch_size, generator, timestep_exponent, weights)
+                drawn = self._draw(batch_size, generator, weights)
                 self._prefetch(drawn, context_length, n_ahead)
                 yield drawn
 
@@ -189,25 +186,15 @@ class FlatSteps:
         by_return = 1.0 + return_weight * returns / (returns.max() or 1.0)
         return th.from_numpy(self.weights * self.episodes.lengths * by_return).float()
 
-    def _draw(
-        self,
-        batch_size: int,
-        generator: th.Generator | None,
-        timestep_exponent: float = 1.0,
-        episode_weights: th.Tensor | None = None,
-    ) -> th.Tensor:
+    def _draw(self, batch_size: int, generator: th.Generator | None, episode_weights: th.Tensor | None = None) -> th.Tensor:
         """Ends of windows as for :meth:`windows`, drawn where the generator is; see :meth:`batches`."""
         device = self.device if generator is None else generator.device
-        if episode_weights is not None:
-            episodes = th.multinomial(episode_weights, batch_size, True, generator=generator).to(self._stops.device)
-        else:
-            positions = th.randint(len(self), (batch_size,), generator=generator, device=device).to(self._stops.device)
-            if timestep_exponent == 1.0:
-                return positions
-            episodes = th.searchsorted(self._stops, positions, right=True)
+        if episode_weights is None:
+            return th.randint(len(self), (batch_size,), generator=generator, device=device).to(self._stops.device)
+        episodes = th.multinomial(episode_weights, batch_size, True, generator=generator).to(self._stops.device)
         u = th.rand(batch_size, generator=generator, device=device).to(self._stops.device)
         firsts, lasts = self._firsts[episodes], self._stops[episodes] - 1
-        timesteps = ((lasts + 1 - firsts) * u**timestep_exponent).long()
+        timesteps = ((lasts + 1 - firsts) * u).long()
         return th.minimum(firsts + timesteps, lasts)  # a product may round to T
 
     def _prefetch(self, ends: th.Tensor, context_length: int, n_ahead: int) -> None:

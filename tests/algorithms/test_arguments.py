@@ -21,7 +21,6 @@ REFUSED = {
     "learning_rate": (0, -1, NAN),
     "ema_decay": (1.0, -0.1, NAN),
     "dataset_fraction": (0, 1.5, NAN),
-    "timestep_exponent": (0, -1.0, float("inf"), NAN),
     "return_weight": (-1.0, float("inf"), NAN),
     "return_steps": (-1, 2.5),
     "precision": ("float8",),
@@ -161,7 +160,7 @@ def test_an_unknown_argument_of_the_policy_is_refused_with_those_accepted(algori
 
 NUMPY = dict(
     batch_size=np.int64(8), context_length=np.int32(4), learning_rate=np.float32(1e-3), weight_decay=np.float64(0.01),
-    warmup_steps=np.int64(2), max_grad_norm=np.float32(0.5), ema_decay=np.float64(0.9), timestep_exponent=np.float32(1.5),
+    warmup_steps=np.int64(2), max_grad_norm=np.float32(0.5), ema_decay=np.float64(0.9),
     dataset_fraction=np.float32(0.5), dataset_seed=np.int64(1), return_weight=np.float32(5.0),
 )  # fmt: skip
 NUMPY_POLICY = dict(

@@ -17,7 +17,7 @@ from tests.conftest import record_random_episodes
 N_STEPS, N_BEFORE = 20, 7
 # Dropout, an average, a warm-up and a decay: all that could start anew.
 SETTINGS = dict(
-    ema_decay=0.9, warmup_steps=3, learning_rate_schedule="cosine", learning_rate=1e-3, timestep_exponent=1.5,
+    ema_decay=0.9, warmup_steps=3, learning_rate_schedule="cosine", learning_rate=1e-3,
     policy_kwargs=dict(dropout=0.2),
 )  # fmt: skip
 

@@ -85,23 +85,7 @@ def test_windows_end_at_every_step_with_equal_probability():
     assert batch.mask[:, -1].all()
 
 
-def test_windows_end_near_an_episode_s_start_as_often_as_the_exponent_says():
-    """Of T steps, the first s hold a share of (s / T)^(1 / e); each episode keeps its share of all."""
-    buffer = make_buffer([100, 300, 1]).select(np.array([1, 2, 0]))
-    n_draws = 40_000
-    buffer.observations[:, 0] = th.tensor([0, 1, 2]).repeat_interleave(th.tensor([100, 300, 1]))
-    batch = next(buffer.batches(n_draws, 1, th.Generator().manual_seed(5), timestep_exponent=2.0))
-    episodes, all_timesteps = batch.observations[:, 0, 0].long().numpy(), batch.timesteps[:, 0].numpy()
-    assert np.bincount(episodes) / n_draws == pytest.approx([100 / 401, 300 / 401, 1 / 401], abs=0.01)
-    for episode, length in ((0, 100), (1, 300)):
-        timesteps = all_timesteps[episodes == episode]
-        assert timesteps.max() == length - 1
-        for share in (0.01, 0.04, 0.25, 0.64):
-            assert np.mean(timesteps < share * length) == pytest.approx(share**0.5, abs=0.02)
-
-
-@pytest.mark.parametrize("timestep_exponent", [1.0, 2.0])
-def test_better_episodes_are_drawn_more_often_by_the_weight_of_their_returns(timestep_exponent: float):
+def test_better_episodes_are_drawn_more_often_by_the_weight_of_their_returns():
     """Steps of returns -10, 0 and 10 are drawn as 1 to 3.5 to 6; of equal returns, alike."""
     lengths, returns, n_draws = np.array([100, 300, 50]), np.array([0.0, 10.0, -10.0]), 40_000
     buffer = make_buffer(list(lengths))
@@ -110,7 +94,7 @@ def test_better_episodes_are_drawn_more_often_by_the_weight_of_their_returns(tim
     def shares(returns: np.ndarray) -> np.ndarray:
         buffer.episodes = buffer.episodes._replace(returns=returns)
         generator = th.Generator().manual_seed(5)
-        batch = next(buffer.batches(n_draws, 1, generator, timestep_exponent, return_weight=5.0))
+        batch = next(buffer.batches(n_draws, 1, generator, return_weight=5.0))
         assert batch.timesteps.max() == 299
         return np.bincount(batch.observations[:, 0, 0].long().numpy()) / n_draws
 
@@ -125,7 +109,7 @@ def test_sampling_repeats_with_the_same_seed():
     assert all(th.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
-@pytest.mark.parametrize("choices", [{}, {"timestep_exponent": 2.0}, {"return_weight": 5.0}], ids=str)
+@pytest.mark.parametrize("choices", [{}, {"return_weight": 5.0}], ids=str)
 def test_batches_differ_repeat_with_the_same_seed_and_have_no_end(choices: dict[str, float]):
     buffer = make_buffer([10, 10])
     first, second = (
@@ -147,7 +131,7 @@ def test_batches_are_one_sample_after_the_other():
 def test_batches_take_their_randomness_from_their_generator_alone():
     buffer = make_buffer([10, 10])
     state = th.get_rng_state()
-    next(buffer.batches(32, 5, th.Generator().manual_seed(3), 2.0))
+    next(buffer.batches(32, 5, th.Generator().manual_seed(3), return_weight=5.0))
     assert th.equal(th.get_rng_state(), state)
 
 
