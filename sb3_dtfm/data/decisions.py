@@ -77,9 +77,8 @@ def _dropout(buffer: TrajectoryBuffer, correlation: float) -> Decision:
     per_dimension = len(buffer) / int(buffer.observation_space.shape[0])
     noisy = per_dimension < FEW_STEPS_PER_DIMENSION and correlation < NOISY
     reason = (
-        f"There are {per_dimension:,.0f} recorded steps for each dimension of the observation, and successive changes of an "
-        f"action correlate by {correlation:.2f}: {'few' if per_dimension < FEW_STEPS_PER_DIMENSION else 'many'} steps, "
-        f"{'noise' if correlation < NOISY else 'no noise'}."
+        f"There are {per_dimension:,.0f} recorded steps for each dimension of the observation ({FEW_STEPS_PER_DIMENSION} are "
+        f"enough), and successive changes of an action correlate by {correlation:.2f} (noise does by less than {NOISY})."
     )
     return Decision("dropout", DROPOUT if noisy else 0.0, reason)
 
@@ -112,7 +111,7 @@ def _return_steps(buffer: TrajectoryBuffer) -> Decision:
     rewards = buffer.rewards[buffer.rows]
     n_equal = int((rewards == rewards.mode().values).sum())
     varies = 2 * n_equal < len(rewards)
-    reason = f"{n_equal / len(rewards):.0%} of the rewards are the same number."
+    reason = f"{n_equal / len(rewards):.0%} of the rewards are one number (more than half if they tell of success alone)."
     return Decision("return_steps", RETURN_STEPS if varies else 0, reason)
 
 
@@ -130,6 +129,6 @@ def _kind_of_actor(errors: PredictionErrors | None, correlation: float) -> list[
         reason = "There are too few episodes to compare how observation and previous action predict actions."
     # Ten Lifts by a script are solved in 76 % without robust units and in 43 % with them; people's door 6 and 49 %.
     robust = not plans or correlation < NOISY
-    noise = f"Successive changes of an action correlate by {correlation:.2f} ({'noise' if robust else 'no noise'})."
+    noise = f"Successive changes of an action correlate by {correlation:.2f} (noise does by less than {NOISY})."
     units = Decision("calm_units", robust, noise if plans else reason)
     return [*(Decision(name, value, reason) for name, value in settings.items()), units]
