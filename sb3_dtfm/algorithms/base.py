@@ -204,7 +204,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
             buffer = self._read_dataset()
             self.max_timestep = int(buffer.episode_lengths.max())
             self._decide(buffer)
-            taken = self._take(buffer)
+            taken = self._learn_from(buffer)
             self.score_reference = buffer.score_reference
             self._setup_model()
             normalization = self.policy.normalization
@@ -265,7 +265,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
 
     def _load_buffer(self) -> TrajectoryBuffer:
         """The dataset of a model whose settings stand, as it is learned from."""
-        return self._take(self._read_dataset())
+        return self._learn_from(self._read_dataset())
 
     def _read_dataset(self) -> TrajectoryBuffer:
         """Read the dataset and check it against the spaces, which it defines where there is no environment."""
@@ -292,7 +292,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         self.return_reference = return_reference(buffer)
         return buffer
 
-    def _take(self, buffer: TrajectoryBuffer) -> TrajectoryBuffer:
+    def _learn_from(self, buffer: TrajectoryBuffer) -> TrajectoryBuffer:
         """
         Learn from these episodes from now on.
 

@@ -77,8 +77,8 @@ def _dropout(buffer: TrajectoryBuffer, correlation: float) -> Decision:
     per_dimension = len(buffer) / int(buffer.observation_space.shape[0])
     noisy = per_dimension < FEW_STEPS_PER_DIMENSION and correlation < NOISY
     reason = (
-        f"There are {per_dimension:,.0f} recorded steps for each dimension of the observation ({FEW_STEPS_PER_DIMENSION} are "
-        f"enough), and successive changes of an action correlate by {correlation:.2f} (noise does by less than {NOISY})."
+        f"There are {per_dimension:,.0f} recorded steps for each dimension of the observation, of {FEW_STEPS_PER_DIMENSION} "
+        f"needed, and successive changes of an action correlate by {correlation:.2f} (noise does by less than {NOISY})."
     )
     return Decision("dropout", DROPOUT if noisy else 0.0, reason)
 
