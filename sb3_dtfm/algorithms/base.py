@@ -111,8 +111,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
     :param compile: compile the loss with `torch.compile`; None does so on a GPU, where one process starts its kernels as a
         CUDA graph. It takes a minute, and a C++ compiler
     :param policy_kwargs: arguments of the policy, for example `embed_dim`, `n_layers`, `n_heads`, `dropout`, `kv_cache`. The
-        data decide `dropout`, `chunk_size`, `n_solver_steps`, `regression_coef`, `timestep_embedding`, `calm_units` and
-        `return_conditioning` where they are not given, see :mod:`sb3_dtfm.data.decisions`
+        data decide `dropout`, `chunk_size`, `n_solver_steps`, `regression_coef`, `timestep_embedding`, `calm_units`,
+        `return_conditioning` and `return_range` where they are not given, see :mod:`sb3_dtfm.data.decisions`
     :param stats_window_size: as in SB3; offline learning collects no episodes
     :param tensorboard_log: folder of the TensorBoard log, None for no log
     :param verbose: 0 silent, 1 prints the log

@@ -46,6 +46,7 @@ ACCEPTED: dict[str, Rule] = {
     "chunk_size": COUNT,
     "weight_decay": NOT_NEGATIVE,
     "clip_return_to_go": BOOLEAN,
+    "return_range": BOOLEAN,
     "return_scaling": Choice(RETURN_SCALINGS),
     "return_conditioning": BOOLEAN,
     "film_return_to_go": BOOLEAN,
@@ -85,9 +86,10 @@ class SequencePolicy(ActingPolicy):
         et al., 2023; Chi et al., 2023). 1 is Decision Transformer's
     :param n_action_steps: how many of them are carried out before the policy looks again, half of them if not given
     :param weight_decay: AdamW's, on weight matrices only
-    :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step, and from such an
-        observation, see :class:`~sb3_dtfm.networks.return_range.ReturnRange`. Asking for more than any episode reached, or
-        falling behind, then stays an input like those the policy learned from
+    :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step. Asking for more than
+        any episode reached, or falling behind, then stays an input like those the policy learned from
+    :param return_range: with `clip_return_to_go`, keep it also within what may be expected from such an observation, see
+        :class:`~sb3_dtfm.networks.return_range.ReturnRange`
     :param return_scaling: "timestep" or "max", see :class:`~sb3_dtfm.policies.normalization.Normalization`
     :param return_conditioning: learn and act by the return-to-go; without it, the policy clones what was recorded
     :param film_return_to_go: let the return-to-go scale and shift what each block of the trunk gets, besides being a token
@@ -130,6 +132,7 @@ class SequencePolicy(ActingPolicy):
         n_action_steps: int | None = None,
         weight_decay: float = 1e-3,
         clip_return_to_go: bool = True,
+        return_range: bool = True,
         return_scaling: str = "timestep",
         return_conditioning: bool = True,
         film_return_to_go: bool = True,
@@ -176,8 +179,8 @@ class SequencePolicy(ActingPolicy):
         film = film_return_to_go and return_conditioning
         trunk = SequenceTrunk(*sizes, dropout, timestep_embedding, tokens_per_step, film)
         head = head_class(embed_dim, self.chunk_size * self.action_dim, **head_options)
-        return_range = ReturnRange(self.observation_dim) if clip_return_to_go and return_conditioning else None
-        self.network = SequenceNetwork(trunk, head, return_range)
+        ranged = return_range and clip_return_to_go and return_conditioning
+        self.network = SequenceNetwork(trunk, head, ReturnRange(self.observation_dim) if ranged else None)
         self.ema_network = copy.deepcopy(self.network).requires_grad_(False) if ema else None
         self.optimizer = self._make_optimizer(lr_schedule(1.0))
         generator = th.Generator().manual_seed(0 if seed is None else seed)

@@ -84,7 +84,8 @@ def test_returns_count_where_they_tell_how_an_episode_acts(kind, expected):
 def test_returns_are_not_expected_where_a_reward_tells_of_success_alone():
     buffer = make_buffer("ladder")
     buffer.rewards[buffer.timesteps < 39] = 0.0
-    assert settings(buffer)["return_steps"] == 0
+    decided = settings(buffer)
+    assert (decided["return_steps"], decided["return_range"]) == (0, False)
 
 
 def test_returns_that_are_all_alike_tell_nothing():
