@@ -77,8 +77,8 @@ def _dropout(buffer: TrajectoryBuffer, correlation: float) -> Decision:
     per_dimension = len(buffer) / int(buffer.observation_space.shape[0])
     noisy = per_dimension < FEW_STEPS_PER_DIMENSION and correlation < NOISY
     reason = (
-        f"There are {per_dimension:,.0f} recorded steps for each dimension of the observation ({FEW_STEPS_PER_DIMENSION} are "
-        f"many), and successive changes of an action correlate by {correlation:.2f} (noise does by less than {NOISY})."
+        f"There are {per_dimension:,.0f} recorded steps for each dimension of the observation ({FEW_STEPS_PER_DIMENSION} "
+        f"are many), and successive changes of an action correlate by {correlation:.2f} (noise does by less than {NOISY})."
     )
     return Decision("dropout", DROPOUT if noisy else 0.0, reason)
 
@@ -106,9 +106,10 @@ def _by_reward(buffer: TrajectoryBuffer) -> list[Decision]:
     Whether it counts which returns may be expected from an observation, instead of what was recorded and is asked for.
 
     With returns expected after 50 steps three mediocre cheetahs with noise return 4,760 and 4,383 (two seeds) instead of
-    4,237, both at the target's pace. Where a reward only tells of success, success may be expected from everywhere: a maze of random walks is solved in
-    1 % instead of 27 %. Nor may a failure be: of cans of which every second one is dropped, a policy that asks for no more
-    than what followed from there puts away 70 %, one that always asks for success 96 %.
+    4,237, both at the target's pace. Where a reward only tells of success, success may be expected from everywhere: a maze
+    of random walks is solved in 1 % instead of 27 %. Nor may failure be: of cans of which every second one is dropped, a
+    policy that asks for no more than what followed from there puts away 70 %, one that always asks for success 96 %; the
+    maze is solved in 27 and 44 %.
     """
     rewards = buffer.rewards[buffer.rows]
     n_equal = int((rewards == rewards.mode().values).sum())
