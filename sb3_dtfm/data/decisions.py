@@ -71,7 +71,8 @@ def _dropout(buffer: TrajectoryBuffer) -> Decision:
     """
     Few steps of many dimensions are learned by heart: Relocate from 128 steps for each dimension is solved in 53 % without
     dropout and in 100 % with it, ten demonstrations of Lift in 61 and 97 % (DT) and 78 and 94 % (DTFM), of Can in 38 and
-    54 % (DT), but 68 and 49 % (DTFM). Elsewhere it blurs: Pendulum from 2,000 steps for each returns -160 without, -272 with.
+    54 % (DT), but 68 and 49 % (DTFM). Elsewhere it blurs: Pendulum from 2,000 steps for each dimension returns -160 without
+    and -272 with it.
     """
     per_dimension = len(buffer) / int(buffer.observation_space.shape[0])
     few = per_dimension < FEW_STEPS_PER_DIMENSION
