@@ -14,6 +14,18 @@ ROOT = Path(__file__).parents[2]
 STUDIES = ("time-steps", "windows/*_uniform-windows.jsonl", "paused", "mixed", "few", "noisy", "two-ways", "styles")
 REPORTS = {"docs": ("suite",), "docs/studies": STUDIES}
 
+# README's name of a data set of the suite, and the report's.
+IN_README = {
+    "Hopper, one agent *": "hopper*",
+    "InvertedDoublePendulum, one agent": "inverted-double-pendulum",
+    "Pendulum, one agent *": "pendulum*",
+    "Pusher, one agent": "pusher",
+    "A maze, by a planner": "maze-planned",
+    "Adroit hammer, 25 episodes": "hammer",
+    "Adroit pen, 50 episodes": "pen",
+    "Adroit relocate, 25 episodes *": "relocate*",
+}
+
 
 def test_the_suite_of_data_sets_is_what_the_benchmark_reads(monkeypatch):
     monkeypatch.setattr(grid, "import_packages", lambda *_: None)  # which not everybody has
@@ -31,3 +43,10 @@ def test_a_report_shows_the_committed_rows(docs, tmp_path):
     assert (ROOT / docs / "report.md").read_text() == (tmp_path / "report.md").read_text()
     for figure in tmp_path.glob("*.png"):
         assert (ROOT / docs / figure.name).is_file()
+
+
+def test_readme_says_what_the_report_says():
+    report, readme = (ROOT / "docs" / "report.md").read_text(), (ROOT / "README.md").read_text().splitlines()
+    for name, data_set in IN_README.items():
+        (line,) = (each for each in readme if each.startswith(f"| {name} |"))
+        assert f"\n{line.replace(name, data_set).removesuffix(' |')} | " in report, name

@@ -128,7 +128,7 @@ def test_windows_fractions_and_statistics_of_a_cache_are_those_from_memory(
     n_ahead: int, robomimic_file: Path, tmp_path: Path
 ):
     buffers = [load(robomimic_file, cache).random_fraction(0.5, 1) for cache in (None, tmp_path / "cache")]
-    batches = [buffer.batches(20, 5, th.Generator().manual_seed(0), 1.5, n_ahead) for buffer in buffers]
+    batches = [buffer.batches(20, 5, th.Generator().manual_seed(0), n_ahead) for buffer in buffers]
     for from_memory, cached in itertools.islice(zip(*batches, strict=True), 3):
         assert all(th.equal(ours, theirs) for ours, theirs in zip(cached, from_memory, strict=True))
     for ours, theirs in zip(*(buffer.statistics() for buffer in buffers), strict=True):
