@@ -113,7 +113,7 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     An episode that is ahead of its target keeps the target's pace: in an environment with a time limit of T steps it is
     shown at least target (1 - t / T). Otherwise a policy that leaves out its recordings' noise, and so returns more, is
-    asked for less and less, and goes on as a worse agent did.
+    asked for less and less, and acts as a worse agent did.
 
     `step` also takes several actions, (N, A): they are carried out one after the other until the episode ends, rewards are
     added up, and `info` has the observations between them, stacked by key, under `BETWEEN`. So whoever decides once for

@@ -44,8 +44,9 @@ def decide(buffer: TrajectoryBuffer) -> list[Decision]:
     :param buffer: what is learned from
     """
     errors = prediction_errors(buffer)
-    decisions = [_batch_size(buffer), _dropout(buffer), *_by_return(errors)]
-    if decisions[-1].value:  # returns tell
+    by_return = _by_return(errors)
+    decisions = [_batch_size(buffer), _dropout(buffer), *by_return]
+    if all(each.value for each in by_return):
         decisions += _by_reward(buffer)
     if isinstance(buffer.action_space, spaces.Box):
         decisions += _kind_of_actor(errors, correlation_of_changes(buffer))
