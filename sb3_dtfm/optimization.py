@@ -1,15 +1,21 @@
 """Small parts of the learn loop: learning rate, precision, threads, and means of what was measured."""
 
 import contextlib
+import functools
 import math
 import os
+import time
 from collections.abc import Iterator
 
 import numpy as np
 import torch as th
+from torch import nn
+from torch.nn import functional as F
 
 LEARNING_RATE_SCHEDULES = ("constant", "linear", "cosine")
 PRECISIONS = ("auto", "float32", "bfloat16")
+# Rows and repetitions that decide which of them is faster on a CPU.
+TIMED_ROWS, N_TIMES = 512, 5
 # Multiplications of a gradient step up to which one thread is as quick as two, which wait for one another.
 ONE_THREADS_PRODUCTS = 3e9
 
@@ -31,22 +37,69 @@ def learning_rate_factor(schedule: str, step: int, progress: float, warmup_steps
     return factor
 
 
-def has_fast_bfloat16(device: th.device) -> bool:
-    """Whether matrix products in bfloat16 are faster than in float32 on this device."""
+def multiplies_bfloat16(device: th.device) -> bool:
+    """Whether the hardware has instructions for matrix products in bfloat16, which need not be faster."""
     if device.type == "cuda":
         return th.cuda.is_bf16_supported(including_emulation=False)
     return th.cpu._is_avx512_bf16_supported() or th.cpu._is_amx_tile_supported()
+
+
+def choose_precision(precision: str, network: nn.Module, n_rows: int, device: th.device) -> tuple[str, str]:
+    """
+    The precision that training multiplies matrices in, and why.
+
+    :param precision: one of `PRECISIONS`; "auto" is bfloat16 where the hardware multiplies in it, on a CPU only if that is
+        faster than float32 for the network's own products, which are timed once for each process
+    :param network: its linear layers count
+    :param n_rows: rows that a gradient step multiplies by a weight
+    :param device: where training runs
+    :return: "float32" or "bfloat16", and a sentence
+    """
+    if precision != "auto":
+        return precision, f"Matrix products are in {precision}, as asked for."
+    if not multiplies_bfloat16(device):
+        return "float32", f"Matrix products are in float32: this {device.type} has no instructions for bfloat16."
+    if device.type == "cuda":
+        return "bfloat16", "Matrix products are in bfloat16, which this GPU has instructions for."
+    weights = (layer.weight for layer in network.modules() if isinstance(layer, nn.Linear))
+    shapes = tuple(sorted({(weight.shape[0], weight.shape[1]) for weight in weights}))
+    ms = {name: products_ms(name, shapes, min(n_rows, TIMED_ROWS), th.get_num_threads()) for name in PRECISIONS[1:]}
+    fastest = min(ms, key=lambda name: ms[name])
+    measured = ", ".join(f"{name} {each:.2f} ms" for name, each in ms.items())
+    return fastest, f"Matrix products are in {fastest}, the faster one here: {measured}."
+
+
+@functools.cache
+def products_ms(precision: str, shapes: tuple[tuple[int, int], ...], n_rows: int, n_threads: int) -> float:
+    """
+    Milliseconds of one linear layer of each shape on the CPU, forward and backward.
+
+    :param precision: "float32" or "bfloat16"
+    :param shapes: of the weights, (outputs, inputs)
+    :param n_rows: of what is multiplied by them
+    :param n_threads: that torch uses, a part of what is remembered
+    :return: the shortest of a few times
+    """
+    layers = [(th.ones(n_rows, n, requires_grad=True), th.ones(m, n, requires_grad=True)) for m, n in shapes]
+    times = []
+    for _ in range(N_TIMES):
+        start = time.perf_counter()
+        for x, weight in layers:
+            with autocast(precision, x.device):
+                product = F.linear(x, weight)
+            product.sum().backward()
+        times.append(time.perf_counter() - start)
+    return 1e3 * min(times)
 
 
 def autocast(precision: str, device: th.device) -> th.autocast:
     """
     The context that training computes its loss in.
 
-    :param precision: one of `PRECISIONS`; "auto" is bfloat16 where the hardware multiplies in it, else float32
+    :param precision: "float32" or "bfloat16"
     :param device: where training runs
     """
-    use_bfloat16 = precision == "bfloat16" or (precision == "auto" and has_fast_bfloat16(device))
-    return th.autocast(device.type, dtype=th.bfloat16, enabled=use_bfloat16)
+    return th.autocast(device.type, dtype=th.bfloat16, enabled=precision == "bfloat16")
 
 
 @contextlib.contextmanager

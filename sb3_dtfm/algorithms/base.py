@@ -107,7 +107,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
     :param warmup_steps: gradient steps over which the learning rate rises linearly from zero; 0 for none
     :param learning_rate_schedule: factor on the learning rate: "constant", or "linear" or "cosine" down to zero
     :param ema_decay: decay of the exponential moving average of weights that acts; 0 acts with the trained weights
-    :param precision: "float32", "bfloat16" (autocast), or "auto": bfloat16 where the hardware multiplies in it
+    :param precision: of matrix products: "float32", "bfloat16" (autocast), or "auto": bfloat16 where the hardware has
+        instructions for it, on a CPU only if it is the faster one for this model, which is measured once
     :param compile: compile the loss with `torch.compile`; None does so on a GPU, where one process starts its kernels as a
         CUDA graph. It takes a minute, and a C++ compiler
     :param policy_kwargs: arguments of the policy, for example `embed_dim`, `n_layers`, `n_heads`, `dropout`, `kv_cache`. The

@@ -6,7 +6,7 @@ import math
 import re
 import time
 from collections.abc import Callable, Iterator
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback, ProgressBarCallback
@@ -27,6 +27,7 @@ from sb3_dtfm.optimization import (
     TRANSITIONS,
     RunningMeans,
     autocast,
+    choose_precision,
     learning_rate_factor,
     seed_default_generator,
     step_seed,
@@ -195,17 +196,26 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
             # several processes it is not measured.
             as_graph = on_gpu and n_processes() == 1
             compute_loss = th.compile(compute_loss, mode="reduce-overhead" if as_graph else "default")
-        return autocast(self.precision, self.device)(compute_loss)
+        n_rows = self.batch_size * self.context_length * self.policy.network.trunk.tokens_per_step
+        asked = self.precision
+        if asked == "auto" and self.device.type == "cpu" and n_processes() > 1:
+            asked = "float32"  # each would measure for itself
+        with threads_that_pay(self._n_products()):
+            precision, reason = choose_precision(asked, self.policy.network, n_rows, self.device)
+        if self.verbose >= 1 and self.precision == "auto" and is_first_process():
+            print(reason, flush=True)
+        return autocast(precision, self.device)(compute_loss)
 
     def _gradient_step(self, batch: Windows, generator: th.Generator, parallel: DataParallel) -> None:
         """Learn from a batch; a loss or gradient that is not finite changes nothing."""
-        self.policy.set_training_mode(True)  # an evaluation in between leaves evaluation mode on
-        optimizer: Any = self.policy.optimizer
+        if not self.policy.training:  # an evaluation in between leaves evaluation mode on
+            self.policy.set_training_mode(True)
+        optimizer = self.policy.optimizer
         self._update_learning_rate(optimizer)
         optimizer.zero_grad(set_to_none=True)  # before the loss, which has the most in memory
         loss, parts = parallel.compute_loss(batch, *self.policy.draw_noise(batch, generator))
         loss.backward()
-        grad_norm = th.nn.utils.clip_grad_norm_(self.policy.clipped_parameters(), self.max_grad_norm or math.inf)
+        grad_norm = optimizer.clip_gradient(self.max_grad_norm or math.inf)
         means = parallel.mean({"loss": loss, "grad_norm": grad_norm, **parts, **self._learn_values()})
         self._means.add(means)
         # The fused optimiser leaves the weights alone where this is 1, and no host has to wait for a GPU to tell.

@@ -114,7 +114,7 @@ def _means(means: RunningMeans) -> dict[str, Any]:
 
 def optimizers(policy: SequencePolicy) -> dict[str, tuple[th.optim.Optimizer, str]]:
     """By the name that SB3 finds them by, each with how the names of its tensors begin in a file."""
-    own = {OPTIMIZER: (policy.optimizer, "")}
+    own: dict[str, tuple[th.optim.Optimizer, str]] = {OPTIMIZER: (policy.optimizer, "")}
     return own if policy.critic is None else {**own, CRITIC_OPTIMIZER: (policy.critic.optimizer, CRITIC_PREFIX)}
 
 

@@ -19,7 +19,7 @@ import sb3_dtfm
 from sb3_dtfm.data import TrajectoryBuffer, load_dataset
 from sb3_dtfm.data.inspection import BEST_SHARE, return_reference
 from sb3_dtfm.data.minari import is_minari, open_minari
-from sb3_dtfm.optimization import has_fast_bfloat16
+from sb3_dtfm.optimization import multiplies_bfloat16
 
 PACKAGES = ("sb3-dtfm", "torch", "stable-baselines3", "rl_zoo3", "gymnasium", "mujoco", "robosuite", "numpy")
 GIT_TIMEOUT = 20  # seconds
@@ -59,7 +59,7 @@ def hardware(device: th.device) -> dict[str, Any]:
         "cpu": _cpu_name(),
         "cores": n_cores(),
         "threads": th.get_num_threads(),
-        "bfloat16": has_fast_bfloat16(device),  # what precision="auto" is there
+        "bfloat16": multiplies_bfloat16(device),
         "gpu": th.cuda.get_device_name(device) if device.type == "cuda" else None,
     }
 

@@ -29,18 +29,21 @@ class TransformerBlock(nn.Module):
     def forward(self, tokens: th.Tensor, attention_bias: th.Tensor, queries: slice = ALL) -> th.Tensor:
         """
         :param tokens: (B, L, D)
-        :param attention_bias: (B, heads, L, L), 0 where the query (third axis) may see the key (fourth), else -inf
+        :param attention_bias: (B, heads, L, L), 0 where the query (third axis) may see the key (fourth), else -inf; not read
+            where L is 1
         :param queries: the Q tokens to compute; nothing is spent on the others beyond their keys and values
         :return: (B, Q, D)
         """
         normed, width = self.attention_norm(tokens), tokens.shape[-1]
+        weight, bias = self.attention_in.weight, self.attention_in.bias
+        if tokens.shape[1] == 1:  # which attends to itself alone, whatever its query and key
+            return self._finish(tokens, self._drop_heads(F.linear(normed, weight[2 * width :], bias[2 * width :])))
         if queries == ALL:
             query, key, value = self.attention_in(normed).split(width, dim=-1)
         else:
-            weight, bias = self.attention_in.weight, self.attention_in.bias
             query = F.linear(normed[:, queries], weight[:width], bias[:width])
             key, value = F.linear(normed, weight[width:], bias[width:]).split(width, dim=-1)
-        return self._finish(tokens[:, queries], query, key, value, attention_bias[:, :, queries])
+        return self._finish(tokens[:, queries], self._attend(query, key, value, attention_bias[:, :, queries]))
 
     def extend(self, tokens: th.Tensor, keys_values: th.Tensor, attention_bias: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -53,15 +56,23 @@ class TransformerBlock(nn.Module):
         """
         query, key, value = self.attention_in(self.attention_norm(tokens)).split(tokens.shape[-1], dim=-1)
         keys_values = fill_in(keys_values, key, value)
-        return self._finish(tokens, query, keys_values[:, 0], keys_values[:, 1], attention_bias), keys_values
+        return self._finish(tokens, self._attend(query, keys_values[:, 0], keys_values[:, 1], attention_bias)), keys_values
 
-    def _finish(
-        self, tokens: th.Tensor, query: th.Tensor, key: th.Tensor, value: th.Tensor, attention_bias: th.Tensor
-    ) -> th.Tensor:
-        """Attend from the tokens' queries, (B, Q, D) each, to all keys and values, (B, L, D); then the MLP."""
+    def _attend(self, query: th.Tensor, key: th.Tensor, value: th.Tensor, attention_bias: th.Tensor) -> th.Tensor:
+        """Attend from queries, (B, Q, D), to all keys and values, (B, L, D): (B, Q, D)."""
         dropout_p = self.dropout if self.training else 0.0
         query, key, value = (x.unflatten(-1, (self.n_heads, -1)).transpose(1, 2) for x in (query, key, value))
-        attended = attention(query, key, value, attention_bias, dropout_p).transpose(1, 2).flatten(start_dim=2)
+        return attention(query, key, value, attention_bias, dropout_p).transpose(1, 2).flatten(start_dim=2)
+
+    def _drop_heads(self, value: th.Tensor) -> th.Tensor:
+        """Dropout of attention weights that are all 1: of a single token's values, (B, 1, D), whole heads."""
+        if not self.training or self.dropout == 0.0:
+            return value
+        weights = dropout(value.new_ones(len(value), 1, self.n_heads, 1), self.dropout, self.training)
+        return (weights * value.unflatten(-1, (self.n_heads, -1))).flatten(start_dim=2)
+
+    def _finish(self, tokens: th.Tensor, attended: th.Tensor) -> th.Tensor:
+        """The residual paths of tokens and of what they attended to, (B, Q, D) each; then the MLP."""
         tokens = dropout_add(tokens, self.attention_out(attended), self.dropout, self.training)
         mapped = self.mlp_out(F.gelu(self.mlp_in(self.mlp_norm(tokens))))
         return dropout_add(tokens, mapped, self.dropout, self.training)
@@ -249,10 +260,11 @@ class SequenceTrunk(nn.Module):
         time = self._time(timesteps)
         return_to_go = self.embed_return_to_go(returns_to_go.unsqueeze(-1)) + time
         observation = self.embed_observation(observations)
-        action = self.embed_action(actions)
         if self.tokens_per_step == 1:
-            known = action[:, :-1] * mask[:, :-1].unsqueeze(-1)  # padding is no action of zeros: it adds nothing at all
-            return return_to_go + observation + F.pad(known, (0, 0, 1, 0))
+            # Padding is no action of zeros: it adds nothing at all.
+            known = self.embed_action(actions[:, :-1]) * mask[:, :-1].unsqueeze(-1)
+            return return_to_go + observation + th.cat((th.zeros_like(observation[:, :1]), known), dim=1)
+        action = self.embed_action(actions)
         return th.stack((return_to_go, observation + time, action + time), dim=2).flatten(1, 2)[:, :-1]
 
     def _films(self, returns_to_go: th.Tensor) -> Sequence[th.Tensor | None]:

@@ -26,6 +26,7 @@ from sb3_dtfm.arguments import (
 )
 from sb3_dtfm.heads import ActionHead
 from sb3_dtfm.heads.base import NOISE_ROWS
+from sb3_dtfm.networks.optimizer import FlatAdamW, FlatTensors
 from sb3_dtfm.networks.return_range import ReturnRange
 from sb3_dtfm.networks.trunk import SequenceTrunk
 from sb3_dtfm.policies.acting import ActingPolicy, standard_normal
@@ -182,7 +183,9 @@ class SequencePolicy(ActingPolicy):
         ranged = return_range and clip_return_to_go and return_conditioning
         self.network = SequenceNetwork(trunk, head, ReturnRange(self.observation_dim) if ranged else None)
         self.ema_network = copy.deepcopy(self.network).requires_grad_(False) if ema else None
-        self.optimizer = self._make_optimizer(lr_schedule(1.0))
+        self.optimizer: FlatAdamW = self._make_optimizer(lr_schedule(1.0))
+        averaged = dict(zip(self.network.parameters(), self.acting_network.parameters(), strict=True))
+        self._averaged = FlatTensors(averaged[parameter] for parameter in self.optimizer.parameters)
         generator = th.Generator().manual_seed(0 if seed is None else seed)
         self.register_buffer("noise_table", self.network.head.deterministic_noise(generator))
         self.gamma, self.critic_steps = gamma, arguments["critic_steps"]
@@ -224,13 +227,14 @@ class SequencePolicy(ActingPolicy):
             raise ValueError(f"{name} learns vectors of numbers and not {action_space}; use DT for Discrete actions.")
         return cls.head_class.discrete
 
-    def _make_optimizer(self, learning_rate: float) -> th.optim.Optimizer:
+    def _make_optimizer(self, learning_rate: float) -> FlatAdamW:
         """AdamW whose weight decay spares biases, norms and embeddings."""
-        matrices = [m.weight for m in self.network.modules() if isinstance(m, nn.Linear)]
-        decayed = {id(weight) for weight in matrices}
+        decayed = {id(module.weight) for module in self.network.modules() if isinstance(module, nn.Linear)}
+        matrices = [parameter for parameter in self.network.parameters() if id(parameter) in decayed]
         others = [parameter for parameter in self.network.parameters() if id(parameter) not in decayed]
-        groups = [{"params": matrices, "weight_decay": self.weight_decay}, {"params": others, "weight_decay": 0.0}]
-        return self.optimizer_class(groups, lr=learning_rate, fused=True)  # type: ignore[call-arg]
+        return_range = self.network.return_range
+        unclipped = [*self.network.head.unclipped_parameters(), *([] if return_range is None else return_range.parameters())]
+        return FlatAdamW(matrices, others, unclipped, learning_rate, self.weight_decay)
 
     def set_weight_decay(self, weight_decay: float) -> None:
         """
@@ -253,13 +257,6 @@ class SequencePolicy(ActingPolicy):
             averaged = {f"ema_{name}": value for name, value in weights.items() if name.startswith("network.")}
             state_dict = {**weights, **averaged}
         return super().load_state_dict(state_dict, strict, assign)
-
-    def clipped_parameters(self) -> list[nn.Parameter]:
-        """The parameters whose gradient norm is logged and clipped."""
-        return_range = self.network.return_range
-        apart = [*self.network.head.unclipped_parameters(), *([] if return_range is None else return_range.parameters())]
-        spared = {id(parameter) for parameter in apart}
-        return [parameter for parameter in self.network.parameters() if id(parameter) not in spared]
 
     def scaled_windows(self, batch: Windows) -> Windows:
         """The windows of a buffer, with actions in [-1, 1]."""
@@ -330,9 +327,7 @@ class SequencePolicy(ActingPolicy):
 
         :param decay: share of the old average that stays
         """
-        averaged = tuple(parameter.data for parameter in self.acting_network.parameters())
-        trained = tuple(parameter.data for parameter in self.network.parameters())
-        th._foreach_lerp_(averaged, trained, 1.0 - decay)
+        self._averaged.flat().lerp_(self.optimizer.flat_weights(), 1.0 - decay)
 
     def acting_settings(self) -> dict[str, Any]:
         """How to act: what may be changed after training, and is saved with the weights."""

@@ -3,7 +3,7 @@
 import pytest
 import torch as th
 
-from sb3_dtfm.networks.trunk import SequenceTrunk, causal_mask
+from sb3_dtfm.networks.trunk import SequenceTrunk, TransformerBlock, causal_mask
 
 B, K, OBSERVATION_DIM, A = 3, 6, 5, 2
 
@@ -183,3 +183,23 @@ def test_kept_keys_and_values_are_attention_with_a_band_once_the_window_slides(t
     plain = causal_mask
     monkeypatch.setattr("sb3_dtfm.networks.trunk.causal_mask", lambda valid: plain(valid) & band)
     assert th.allclose(extended, trunk(**episode), atol=1e-5)
+
+
+def test_a_single_token_attends_to_itself():
+    """What the shortcut leaves out changes neither the hidden state nor a gradient."""
+    block = TransformerBlock(8, 2, 0.0)
+    tokens, bias = th.randn(4, 1, 8), th.zeros(4, 2, 1, 1)
+    short = block(tokens, bias)
+    query, key, value = block.attention_in(block.attention_norm(tokens)).split(8, dim=-1)
+    full = block._finish(tokens, block._attend(query, key, value, bias))
+    assert th.allclose(short, full, atol=1e-6)
+    grads = [th.autograd.grad(each.square().sum(), list(block.parameters())) for each in (short, full)]
+    for mine, theirs in zip(*grads, strict=True):
+        assert th.allclose(mine, theirs, atol=1e-6)
+
+
+def test_dropout_of_a_single_token_drops_whole_heads():
+    block = TransformerBlock(8, 2, 0.5).train()
+    heads = block._drop_heads(th.ones(64, 1, 8)).unflatten(-1, (2, -1))
+    assert set(heads.flatten().tolist()) == {0.0, 2.0}
+    assert th.equal(heads.amin(dim=-1), heads.amax(dim=-1))
