@@ -3,6 +3,7 @@ The rows of `make peers` as a table: success in percent or return, mean over see
 
     PYTHONPATH=studies python -m peers.table results/peers           # a line for each dataset and algorithm
     PYTHONPATH=studies python -m peers.table results/peers --short   # a line for each dataset
+    PYTHONPATH=studies python -m peers.table results/peers --suite results/suite   # and ours by the classes' defaults
 """
 
 import argparse
@@ -20,6 +21,8 @@ from sb3_dtfm.benchmark.report.statistics import student_t
 
 NONE = "-"
 Cells = dict[tuple[str, str], list[Run]]  # by dataset and algorithm
+# What studies/suite.yml calls a dataset of studies/peers.yml, where it has another name there.
+IN_SUITE = {"can-few": "can-10", "walker2d-clean": "walker2d-expert", "pusht-human": "pusht"}
 
 
 def read(folder: Path) -> tuple[Cells, list[str], list[str]]:
@@ -81,13 +84,38 @@ def short_table(folder: Path) -> Iterable[Sequence[str]]:
         yield name, *(f"{bold[algo]}{result(runs[algo])}{bold[algo]}" if algo in runs else NONE for algo in algorithms)
 
 
+def suite_table(folder: Path, suite: Path) -> Iterable[Sequence[str]]:
+    """Lines of DT and DTFM by the classes' defaults and by the settings before them, and of the best other algorithm."""
+    cells, datasets, algorithms = read(folder)
+    defaults: Cells = {}
+    for group in (group for study in read_studies([suite]) for group in study.groups):
+        for (task, _, algo), runs in group.runs.items():
+            defaults.setdefault((task, algo), []).extend(runs)
+    yield "data", "DT", "DTFM", "DT before", "DTFM before", "best of the others"
+    for name in datasets:
+        ours = [defaults.get((IN_SUITE.get(name, name), algo)) for algo in ("dt", "dtfm")]
+        if not any(ours):
+            continue
+        before = [cells.get((name, algo)) for algo in ("dt", "dtfm")]
+        others = {
+            algo: cells[name, algo]
+            for algo in algorithms
+            if algo.partition(",")[0] not in ALGORITHMS and (name, algo) in cells
+        }
+        best = max(others, key=lambda algo: float(np.mean([run.value("final") for run in others[algo]])))
+        yield name, *(result(runs) if runs else NONE for runs in (*ours, *before)), f"{best}: {result(others[best])}"
+
+
 def main() -> None:
     """See the top."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--short", action="store_true")
+    parser.add_argument("--suite", type=Path, metavar="FOLDER", help="rows of studies/suite.yml")
     options = parser.parse_args()
-    header, *lines = (short_table if options.short else long_table)(options.folder)
+    folder = options.folder
+    table = suite_table(folder, options.suite) if options.suite else (short_table if options.short else long_table)(folder)
+    header, *lines = table
     for line in (header, ["---"] * len(header), *lines):
         print(f"| {' | '.join(line)} |")
 
