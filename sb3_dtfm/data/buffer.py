@@ -17,6 +17,7 @@ from sb3_dtfm.data.collecting import collect
 from sb3_dtfm.data.drawing import FlatSteps
 from sb3_dtfm.data.episodes import EpisodeTable, Statistics, moments
 from sb3_dtfm.data.expected import Steps, expected_returns_to_go
+from sb3_dtfm.data.short_episodes import ShortEpisodes
 from sb3_dtfm.data.storage import STEP_ARRAYS, FileStorage, MappedSteps, MemoryStorage
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, returns_to_go
 from sb3_dtfm.files import replacing
@@ -77,7 +78,7 @@ class TrajectoryBuffer(FlatSteps):
     @classmethod
     def from_trajectories(
         cls,
-        trajectories: Iterable[Trajectory],
+        trajectories: Iterable[Trajectory | ShortEpisodes],
         action_space: ActionSpace,
         observation_space: spaces.Box | None = None,
         n_steps: int | None = None,

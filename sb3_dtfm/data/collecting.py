@@ -1,5 +1,6 @@
 """Recorded episodes become the flat arrays of a buffer, each checked on the way."""
 
+import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
@@ -8,6 +9,7 @@ from gymnasium import spaces
 
 from sb3_dtfm.actions import ActionSpace, to_vectors, vector_space
 from sb3_dtfm.data.episodes import EpisodeTable, moments
+from sb3_dtfm.data.short_episodes import ShortEpisodes
 from sb3_dtfm.data.storage import FileStorage, MemoryStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_space, check_size, check_trajectory
 
@@ -16,7 +18,7 @@ ON_INVALID = ("raise", "drop")
 
 
 def collect(
-    trajectories: Iterable[Trajectory],
+    trajectories: Iterable[Trajectory | ShortEpisodes],
     action_space: ActionSpace,
     observation_space: spaces.Box | None,
     n_steps: int | None,
@@ -28,6 +30,7 @@ def collect(
     """
     Arguments are those of :meth:`TrajectoryBuffer.from_trajectories`.
 
+    :param trajectories: or short episodes, many together
     :return: the flat tensors, a row for each episode, the observation space, and what the buffer tells of dropped episodes
     :raises DatasetError: as there
     """
@@ -38,12 +41,13 @@ def collect(
     if n_steps is None and isinstance(trajectories, Sequence):
         n_steps = sum(map(len, trajectories))
     storage.reserve(n_steps or 0)
-    rows: list[tuple] = []
+    tables: list[EpisodeTable] = []
     dropped: list[DatasetError] = []
     start = 0
 
-    def check(trajectory: Trajectory) -> np.ndarray:
+    def check(trajectory: Trajectory | ShortEpisodes) -> np.ndarray:
         nonlocal observation_space
+        trajectory = trajectory.steps if isinstance(trajectory, ShortEpisodes) else trajectory
         space = observation_space or spaces.Box(-np.inf, np.inf, np.shape(trajectory.observations)[1:], np.float32)
         to_go = check_trajectory(trajectory, space, action_space, source)
         if n_stored is not None:
@@ -52,33 +56,38 @@ def collect(
         observation_space = space
         return to_go
 
-    for trajectory, to_go in _checked(trajectories, check, dropped, on_invalid):
+    for episodes, to_go in _checked(trajectories, check, dropped, on_invalid):
+        if isinstance(episodes, ShortEpisodes):
+            steps, (table, to_go) = episodes.steps, episodes.table(start)
+        else:
+            steps, table = episodes, _table_of_one(episodes, start, to_go)
         storage.append(
             {
-                "observations": trajectory.observations,
-                "actions": to_vectors(trajectory.actions, action_space),
-                "rewards": trajectory.rewards,
+                "observations": steps.observations,
+                "actions": to_vectors(steps.actions, action_space),
+                "rewards": steps.rewards,
                 "returns_to_go": to_go,
             }
         )
-        rows.append(_episode_row(trajectory, start, to_go))
-        start += len(trajectory)
-    if observation_space is None or not rows:
+        tables.append(table)
+        start += len(steps)
+    if observation_space is None or not tables:
         left = f" that could be kept of {len(dropped)} (the first: {dropped[0]})" if dropped else ""
         raise DatasetError(f"{source}: holds no episode{left}; at least one is needed.")
     tensors = storage.finish()
-    episodes = EpisodeTable(*(np.array(column) for column in zip(*rows, strict=True)))
-    return tensors, episodes, observation_space, (len(dropped), str(dropped[0])) if dropped else None
+    table = EpisodeTable(*map(np.concatenate, zip(*tables, strict=True)))
+    return tensors, table, observation_space, (len(dropped), str(dropped[0])) if dropped else None
 
 
 def _checked(
-    trajectories: Iterable[Trajectory],
-    check: Callable[[Trajectory], np.ndarray],
+    trajectories: Iterable[Trajectory | ShortEpisodes],
+    check: Callable[[Trajectory | ShortEpisodes], np.ndarray],
     dropped: list[DatasetError],
     on_invalid: str,
-) -> Iterator[tuple[Trajectory, np.ndarray]]:
+) -> Iterator[tuple[Trajectory | ShortEpisodes, np.ndarray]]:
     """
-    Episodes that pass a check, each with what the check made of it.
+    Episodes that pass a check, each with what the check made of it; short ones together, or one by one where they do not
+    pass together.
 
     :param dropped: gets the reason for each other one, where `on_invalid` is "drop"
     """
@@ -90,6 +99,9 @@ def _checked(
         except StopIteration:
             return
         except DatasetError as error:
+            if isinstance(trajectory, ShortEpisodes):
+                iterator = itertools.chain(trajectory.one_by_one(), iterator)
+                continue
             if on_invalid == "raise":
                 raise
             dropped.append(error)
@@ -97,9 +109,9 @@ def _checked(
             yield trajectory, checked
 
 
-def _episode_row(trajectory: Trajectory, start: int, to_go: np.ndarray) -> tuple:
-    """A row of an `EpisodeTable`."""
-    return (
+def _table_of_one(trajectory: Trajectory, start: int, to_go: np.ndarray) -> EpisodeTable:
+    """Of a single episode."""
+    row = (
         start,
         len(trajectory),
         to_go[0],  # the return: the sum of all rewards in float64
@@ -109,3 +121,4 @@ def _episode_row(trajectory: Trajectory, start: int, to_go: np.ndarray) -> tuple
         *moments(trajectory.observations),
         max(to_go.max(), -to_go.min()),
     )
+    return EpisodeTable(*(np.array([value]) for value in row))

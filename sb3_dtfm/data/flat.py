@@ -1,9 +1,11 @@
 """Reading flat arrays, episode after episode, into a `TrajectoryBuffer`: of an `.npz` file, an hdf5 file, or memory."""
 
 import contextlib
+import itertools
 import os
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import h5py
@@ -15,6 +17,7 @@ from sb3_dtfm.data.arrays import ENV_ID, EXPECTED, NPZ_SUFFIX, Arrays, opened
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, existing_file
 from sb3_dtfm.data.observations import check_no_images
+from sb3_dtfm.data.short_episodes import ShortEpisodes, blocks
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_flags
 from sb3_dtfm.envs.success import SUCCESS
@@ -167,20 +170,29 @@ def _read(
     action_space = bounded_space(action_bounds, action_space, actions, source)
     actions = fitted(actions, action_space, clip_actions)
 
-    def trajectory(episode: int) -> Trajectory:
-        start, stop = stops[episode - 1] if episode else 0, stops[episode]
+    def steps(first: int, end: int) -> Trajectory:
+        """Those of some episodes, one after the other."""
+        start, stop = stops[first - 1] if first else 0, stops[end - 1]
         return Trajectory(
             observations=observation[start:stop],
             actions=actions[start:stop],
             rewards=rewards[start:stop, 0],
             terminated=bool(terminated[stop - 1]),
             truncated=bool(truncated[stop - 1]),
-            success=None if np.isnan(successes[episode]) else bool(successes[episode]),
-            name=f"episode {episode}",
+            success=None if np.isnan(successes[first]) else bool(successes[first]),
+            name=f"episode {first}",
         )
 
+    def episodes(first: int, end: int) -> Trajectory | ShortEpisodes:
+        if end - first == 1:
+            return steps(first, end)
+        here, last = slice(first, end), stops[first:end] - 1
+        lengths = np.diff(stops[here], prepend=stops[first - 1] if first else 0)
+        one_by_one = partial(map, steps, range(first, end), range(first + 1, end + 1))
+        return ShortEpisodes(steps(first, end), lengths, terminated[last], truncated[last], successes[here], one_by_one)
+
     return TrajectoryBuffer.from_trajectories(
-        map(trajectory, range(len(stops))),
+        itertools.starmap(episodes, blocks(stops)),
         action_space,
         n_steps=n_steps,
         source=source,
