@@ -17,13 +17,13 @@ REPORTS = {"docs": ("suite",), "docs/studies": STUDIES}
 # README's name of a data set of the suite, and the report's.
 IN_README = {
     "Hopper, one agent *": "hopper*",
-    "InvertedDoublePendulum, one agent": "inverted-double-pendulum",
-    "Pendulum, one agent *": "pendulum*",
-    "Pusher, one agent": "pusher",
-    "A maze, by a planner": "maze-planned",
-    "Adroit hammer, 25 episodes": "hammer",
-    "Adroit pen, 50 episodes": "pen",
-    "Adroit relocate, 25 episodes *": "relocate*",
+    "HalfCheetah, five agents *": "halfcheetah-ladder*",
+    "Walker2d, five agents": "walker2d-ladder",
+    "Walker2d, three noisy agents *": "walker2d-mediocre-noisy*",
+    "Swimmer, one agent": "swimmer",
+    "Robosuite Stack, 50 scripted demonstrations": "stack-50",
+    "Robosuite Can, half of 100 dropped *": "can-dropped*",
+    "Adroit door, people *": "door-human*",
 }
 
 

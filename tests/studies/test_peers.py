@@ -342,3 +342,11 @@ def test_the_page_says_what_the_rows_say():
     columns = ("data", "algorithm", "final", "minutes", "gradient steps", "ms an action")
     page = (ROOT / "docs" / "studies" / "peers.md").read_text()
     assert "\n".join(f"| {' | '.join(row[each] for each in columns)} |" for row in shown) in page
+
+
+def test_the_page_shows_the_defaults_beside_the_other_libraries():
+    header, *lines = table.suite_table(ROOT / "results" / "peers", ROOT / "results" / "suite")
+    page = (ROOT / "docs" / "studies" / "peers.md").read_text()
+    assert len(lines) >= 8
+    for line in (header, *lines):
+        assert f"\n| {' | '.join(line)} |" in page
