@@ -93,6 +93,7 @@ def _checked(
     """
     iterator = iter(trajectories)
     while True:
+        trajectory: Trajectory | ShortEpisodes | None = None  # as long as it cannot be read
         try:
             trajectory = next(iterator)
             checked = check(trajectory)
@@ -101,10 +102,10 @@ def _checked(
         except DatasetError as error:
             if isinstance(trajectory, ShortEpisodes):
                 iterator = itertools.chain(trajectory.one_by_one(), iterator)
-                continue
-            if on_invalid == "raise":
+            elif on_invalid == "raise":
                 raise
-            dropped.append(error)
+            else:
+                dropped.append(error)
         else:
             yield trajectory, checked
 
