@@ -44,19 +44,16 @@ def multiplies_bfloat16(device: th.device) -> bool:
     return th.cpu._is_avx512_bf16_supported() or th.cpu._is_amx_tile_supported()
 
 
-def choose_precision(precision: str, network: nn.Module, n_rows: int, device: th.device) -> tuple[str, str]:
+def choose_precision(network: nn.Module, n_rows: int, device: th.device) -> tuple[str, str]:
     """
-    The precision that training multiplies matrices in, and why.
+    What the precision "auto" is, and why: bfloat16 where the hardware multiplies in it, on a CPU only if that is faster than
+    float32 for the network's own products, which are timed once for each process.
 
-    :param precision: one of `PRECISIONS`; "auto" is bfloat16 where the hardware multiplies in it, on a CPU only if that is
-        faster than float32 for the network's own products, which are timed once for each process
     :param network: its linear layers count
     :param n_rows: rows that a gradient step multiplies by a weight
     :param device: where training runs
     :return: "float32" or "bfloat16", and a sentence
     """
-    if precision != "auto":
-        return precision, f"Matrix products are in {precision}, as asked for."
     if not multiplies_bfloat16(device):
         return "float32", f"Matrix products are in float32: this {device.type} has no instructions for bfloat16."
     if device.type == "cuda":

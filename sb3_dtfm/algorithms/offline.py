@@ -196,15 +196,24 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
             # several processes it is not measured.
             as_graph = on_gpu and n_processes() == 1
             compute_loss = th.compile(compute_loss, mode="reduce-overhead" if as_graph else "default")
-        n_rows = self.batch_size * self.context_length * self.policy.network.trunk.tokens_per_step
-        asked = self.precision
-        if asked == "auto" and self.device.type == "cpu" and n_processes() > 1:
-            asked = "float32"  # each would measure for itself
-        with threads_that_pay(self._n_products()):
-            precision, reason = choose_precision(asked, self.policy.network, n_rows, self.device)
-        if self.verbose >= 1 and self.precision == "auto" and is_first_process():
+        return autocast(self._chosen_precision(), self.device)(compute_loss)
+
+    def _chosen_precision(self) -> str:
+        """ "float32" or "bfloat16": what was asked for, or what "auto" is here."""
+        if self.precision != "auto":
+            return self.precision
+        if self.device.type == "cpu" and n_processes() > 1:
+            precision, reason = (
+                "float32",
+                "Matrix products are in float32: each of several processes would measure for itself.",
+            )
+        else:
+            n_rows = self.batch_size * self.context_length * self.policy.network.trunk.tokens_per_step
+            with threads_that_pay(self._n_products()):
+                precision, reason = choose_precision(self.policy.network, n_rows, self.device)
+        if self.verbose >= 1 and is_first_process():
             print(reason, flush=True)
-        return autocast(precision, self.device)(compute_loss)
+        return precision
 
     def _gradient_step(self, batch: Windows, generator: th.Generator, parallel: DataParallel) -> None:
         """Learn from a batch; a loss or gradient that is not finite changes nothing."""

@@ -11,10 +11,19 @@ from sb3_dtfm.actions import ActionSpace, to_vectors, vector_space
 from sb3_dtfm.data.episodes import EpisodeTable, moments
 from sb3_dtfm.data.short_episodes import ShortEpisodes
 from sb3_dtfm.data.storage import FileStorage, MemoryStorage
-from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_space, check_size, check_trajectory
+from sb3_dtfm.data.trajectories import (
+    DatasetError,
+    Trajectory,
+    check_action_space,
+    check_finite,
+    check_size,
+    check_trajectory,
+)
 
 # What may become of an episode that is refused.
 ON_INVALID = ("raise", "drop")
+# What a check makes of episodes: their rows of the table, and the returns-to-go of their steps.
+Checked = tuple[EpisodeTable, np.ndarray]
 
 
 def collect(
@@ -45,22 +54,23 @@ def collect(
     dropped: list[DatasetError] = []
     start = 0
 
-    def check(trajectory: Trajectory | ShortEpisodes) -> np.ndarray:
+    def check(episodes: Trajectory | ShortEpisodes) -> tuple[EpisodeTable, np.ndarray]:
         nonlocal observation_space
-        trajectory = trajectory.steps if isinstance(trajectory, ShortEpisodes) else trajectory
+        trajectory = episodes.steps if isinstance(episodes, ShortEpisodes) else episodes
         space = observation_space or spaces.Box(-np.inf, np.inf, np.shape(trajectory.observations)[1:], np.float32)
         to_go = check_trajectory(trajectory, space, action_space, source)
         if n_stored is not None:
             n_rows, n_columns = max(n_steps or 0, start + len(trajectory)), space.shape[0] + n_action_numbers + 2
             check_size(4 * n_rows * n_columns, n_stored, f"{source}: {n_rows} steps")
         observation_space = space
-        return to_go
+        if isinstance(episodes, Trajectory):
+            return _table_of_one(episodes, start, to_go), to_go
+        table, to_go = episodes.table(start)
+        check_finite(to_go, "returns-to-go, sums of rewards,", source)
+        return table, to_go
 
-    for episodes, to_go in _checked(trajectories, check, dropped, on_invalid):
-        if isinstance(episodes, ShortEpisodes):
-            steps, (table, to_go) = episodes.steps, episodes.table(start)
-        else:
-            steps, table = episodes, _table_of_one(episodes, start, to_go)
+    for episodes, (table, to_go) in _checked(trajectories, check, dropped, on_invalid):
+        steps = episodes.steps if isinstance(episodes, ShortEpisodes) else episodes
         storage.append(
             {
                 "observations": steps.observations,
@@ -81,10 +91,10 @@ def collect(
 
 def _checked(
     trajectories: Iterable[Trajectory | ShortEpisodes],
-    check: Callable[[Trajectory | ShortEpisodes], np.ndarray],
+    check: Callable[[Trajectory | ShortEpisodes], Checked],
     dropped: list[DatasetError],
     on_invalid: str,
-) -> Iterator[tuple[Trajectory | ShortEpisodes, np.ndarray]]:
+) -> Iterator[tuple[Trajectory | ShortEpisodes, Checked]]:
     """
     Episodes that pass a check, each with what the check made of it; short ones together, or one by one where they do not
     pass together.

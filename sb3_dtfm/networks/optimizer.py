@@ -102,6 +102,7 @@ class FlatAdamW(th.optim.AdamW):
         self._moments: dict[str, FlatTensors] = {}
         self._memory: th.Tensor | None = None
         self._gradient: th.Tensor | None = None  # clipped, for the next step
+        self._is_even = True  # all parameters have had as many steps
         self._clipped_parameters = [parameter for parameter in self.parameters if id(parameter) not in apart]
         n_decayed, n_weights = (sum(map(slot_size, each)) for each in (decayed, self.parameters))
         self._parts = (slice(0, n_decayed), slice(n_decayed, n_weights))
@@ -140,11 +141,12 @@ class FlatAdamW(th.optim.AdamW):
         """One step; `found_inf` decides whether it counts."""
         gradient = self._flat_gradient() if self._gradient is None else self._gradient
         self._gradient = None
-        if gradient is None:
+        self._is_even &= gradient is not None
+        steps, mean, square = self._flat_moments()
+        if gradient is None or not self._is_even:
             super().step(closure)
             return
         weights = self.flat_weights()
-        steps, mean, square = self._flat_moments()
         for group, part in zip(self.param_groups, self._parts, strict=True):
             count = steps[0].clone()
             settings = {name: group[name] for name in ("lr", "weight_decay", "eps", "amsgrad", "maximize")}
@@ -173,6 +175,8 @@ class FlatAdamW(th.optim.AdamW):
             kept = self._moments.get(name)
             if kept is None or first[name] is not kept.tensors[0] or last[name] is not kept.tensors[-1]:
                 self._moments[name] = FlatTensors(self.state[parameter][name] for parameter in self.parameters)
+                if name == "step":
+                    self._is_even = len({float(each) for each in self._moments[name].tensors}) == 1
         return tuple(self._moments[name].flat() for name in MOMENTS)
 
     def _begin(self) -> None:

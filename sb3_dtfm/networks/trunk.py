@@ -26,17 +26,17 @@ class TransformerBlock(nn.Module):
         self.mlp_in = Linear(embed_dim, 4 * embed_dim)
         self.mlp_out = Linear(4 * embed_dim, embed_dim)
 
-    def forward(self, tokens: th.Tensor, attention_bias: th.Tensor, queries: slice = ALL) -> th.Tensor:
+    def forward(self, tokens: th.Tensor, attention_bias: th.Tensor | None, queries: slice = ALL) -> th.Tensor:
         """
         :param tokens: (B, L, D)
-        :param attention_bias: (B, heads, L, L), 0 where the query (third axis) may see the key (fourth), else -inf; not read
-            where L is 1
+        :param attention_bias: (B, heads, L, L), 0 where the query (third axis) may see the key (fourth), else -inf; None for
+            a single token, which attends to itself alone
         :param queries: the Q tokens to compute; nothing is spent on the others beyond their keys and values
         :return: (B, Q, D)
         """
         normed, width = self.attention_norm(tokens), tokens.shape[-1]
         weight, bias = self.attention_in.weight, self.attention_in.bias
-        if tokens.shape[1] == 1:  # which attends to itself alone, whatever its query and key
+        if attention_bias is None:
             return self._finish(tokens, self._drop_heads(F.linear(normed, weight[2 * width :], bias[2 * width :])))
         if queries == ALL:
             query, key, value = self.attention_in(normed).split(width, dim=-1)
@@ -203,7 +203,7 @@ class SequenceTrunk(nn.Module):
         """
         tokens = self._tokens(observations, actions, returns_to_go, timesteps, mask)
         tokens = dropout(tokens, self.dropout, self.training)
-        attention_bias = self._attention_bias(mask, tokens.shape[1])
+        attention_bias = None if tokens.shape[1] == 1 else self._attention_bias(mask, tokens.shape[1])
         films = self._films(returns_to_go)
         *lower_blocks, last_block = self.blocks
         for block, film in zip(lower_blocks, films, strict=False):

@@ -80,6 +80,14 @@ def test_a_bad_episode_is_named_or_left_out(arrays, episode):
     assert kept.episode_lengths.tolist() == np.delete(LENGTHS, episode).tolist()
 
 
+def test_returns_to_go_of_each_episode_have_to_be_finite(arrays):
+    """Together with the episode behind it, the first one's would be."""
+    arrays["rewards"] = arrays["rewards"].astype(np.float64)
+    arrays["rewards"][:6] = [0.0, 3e38, 3e38, 0.0, -3e38, -3e38]
+    with pytest.raises(DatasetError, match="episode 0, step 0: returns-to-go, sums of rewards,"):
+        load_dataset(arrays)
+
+
 def test_a_million_episodes_of_one_step_are_read_in_seconds(tmp_path):
     n = 1_000_000
     np.savez(tmp_path / "bandit.npz", observations=np.zeros((n, 2), np.float32), actions=np.zeros((n, 1), np.float32),

@@ -42,14 +42,18 @@ def same_weights(network, reference):
     return all(th.allclose(ours, theirs, rtol=RTOL, atol=0) for ours, theirs in pairs)
 
 
-def test_steps_and_state_dict_are_those_of_torch():
-    network = make_network()
-    ours, reference, torchs = make_optimizers(network)
-    for step in range(N_STEPS):
+def take_steps(ours, network, torchs, reference, n_steps=N_STEPS):
+    for step in range(n_steps):
         for optimizer, each in ((ours, network), (torchs, reference)):
             optimizer.zero_grad()
             backward(each, step)
             optimizer.step()
+
+
+def test_steps_and_state_dict_are_those_of_torch():
+    network = make_network()
+    ours, reference, torchs = make_optimizers(network)
+    take_steps(ours, network, torchs, reference)
     assert same_weights(network, reference)
     mine, theirs = ours.state_dict(), torchs.state_dict()
     assert [group["params"] for group in mine["param_groups"]] == [group["params"] for group in theirs["param_groups"]]
@@ -94,11 +98,8 @@ def test_a_step_that_is_not_finite_changes_nothing():
 def test_memory_that_was_replaced_is_laid_out_again(change):
     network = make_network()
     ours, reference, torchs = make_optimizers(network)
-    for step in range(N_STEPS):
-        for optimizer, each in ((ours, network), (torchs, reference)):
-            optimizer.zero_grad()
-            backward(each, step)
-            optimizer.step()
+    for _ in range(N_STEPS):
+        take_steps(ours, network, torchs, reference, n_steps=1)
         if change == "moved":
             for parameter in network.parameters():
                 parameter.data = parameter.data.clone()
@@ -121,6 +122,11 @@ def test_a_frozen_parameter_stays():
         torchs.step()
         ours.zero_grad()
         torchs.zero_grad()
+    assert same_weights(network, reference)
+    for each in (network, reference):
+        each[0].weight.requires_grad_(True)
+    ours.load_state_dict(copy.deepcopy(ours.state_dict()))
+    take_steps(ours, network, torchs, reference)  # the thawed weight has had fewer steps than the others
     assert same_weights(network, reference)
 
 

@@ -189,7 +189,7 @@ def test_a_single_token_attends_to_itself():
     """What the shortcut leaves out changes neither the hidden state nor a gradient."""
     block = TransformerBlock(8, 2, 0.0)
     tokens, bias = th.randn(4, 1, 8), th.zeros(4, 2, 1, 1)
-    short = block(tokens, bias)
+    short = block(tokens, None)
     query, key, value = block.attention_in(block.attention_norm(tokens)).split(8, dim=-1)
     full = block._finish(tokens, block._attend(query, key, value, bias))
     assert th.allclose(short, full, atol=1e-6)
