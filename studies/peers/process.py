@@ -100,11 +100,34 @@ class PeerProcess:
         :param on_progress: told how many steps of how many are done
         :raises PeerError: it has ended
         """
-        self._send("train", dataset=str(dataset), settings=settings, seed=seed, n_timesteps=n_timesteps, minutes=minutes)
-        self.versions = self._receive().values["versions"]
+        self._begin(dataset, settings, seed, n_timesteps, minutes, in_parts=False)
         while (message := self._receive()).what == "progress":
             on_progress(message.values["done"], message.values["n_steps"])
         return Training(**message.values)
+
+    def begin(self, dataset: Path, settings: dict[str, Any], seed: int, n_timesteps: int, minutes: float) -> None:
+        """
+        Have it ready to :meth:`learn` in parts; the arguments are those of :meth:`train`, and plan its schedules.
+
+        :raises PeerError: it has ended
+        """
+        self._begin(dataset, settings, seed, n_timesteps, minutes, in_parts=True)
+
+    def learn(self, n_steps: int) -> float:
+        """
+        The next gradient steps.
+
+        :param n_steps: how many
+        :return: processor seconds of its process since it was started, without those of acting
+        :raises PeerError: it has ended
+        """
+        self._send("learn", n_steps=n_steps)
+        return self._receive().values["processor_seconds"]
+
+    def _begin(self, dataset: Path, *job: Any, in_parts: bool) -> None:
+        values = dict(zip(("settings", "seed", "n_timesteps", "minutes"), job, strict=True))
+        self._send("train", dataset=str(dataset), in_parts=in_parts, **values)
+        self.versions = self._receive().values["versions"]
 
     def predict(
         self,

@@ -192,12 +192,17 @@ def _milliseconds(times: list[float]) -> float:
     return 1e3 * float(np.median([np.mean(block) for block in np.array_split(times, n_blocks)]))
 
 
-def _act(learner: Learner, dataset: Dataset, questions: BinaryIO, answers: BinaryIO) -> None:
-    """Answer with actions until nobody asks."""
+def _act(learner: Learner, dataset: Dataset, questions: BinaryIO, answers: BinaryIO, not_learning: float = 0.0) -> None:
+    """Answer with actions until nobody asks, and learn in between if asked to."""
     actors: list[Callable[[np.ndarray, float, bool], np.ndarray]] = []
     times: list[float] = []
     while True:
+        paused = time.process_time()
         message = receive(questions)
+        if message.what == "learn":
+            learner.learn(message.values["n_steps"], lambda: None)
+            send(answers, "learned", processor_seconds=time.process_time() - not_learning)
+            continue
         if message.what == "timing":
             send(answers, "timing", action_ms=_milliseconds(times))
             continue
@@ -209,6 +214,7 @@ def _act(learner: Learner, dataset: Dataset, questions: BinaryIO, answers: Binar
             actions.append(act(observation, float(return_to_go), bool(start)))
             times.append(time.perf_counter() - asked)
         send(answers, "actions", {"actions": dataset.to_environment(np.stack(actions))})
+        not_learning += time.process_time() - paused
 
 
 def serve(make: MakeLearner, packages: tuple[str, ...]) -> None:
@@ -222,9 +228,15 @@ def serve(make: MakeLearner, packages: tuple[str, ...]) -> None:
     questions, answers = sys.stdin.buffer, os.fdopen(int(sys.argv[1]), "wb")
     job = receive(questions).values
     send(answers, "ready", versions={name: metadata.version(name) for name in packages})
-    dataset = read_dataset(job["dataset"])
-    learner = _train(job, make, dataset, answers)
+    dataset, trial = read_dataset(job["dataset"]), 0.0
+    if job["in_parts"]:
+        began = time.process_time()
+        n_steps = _planned_steps(job, make, dataset)
+        trial = time.process_time() - began
+        learner = make(job["settings"], dataset, n_steps, job["seed"])
+    else:
+        learner = _train(job, make, dataset, answers)
     try:
-        _act(learner, dataset, questions, answers)
+        _act(learner, dataset, questions, answers, trial)
     except EOFError:
         return
