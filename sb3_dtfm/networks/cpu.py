@@ -66,6 +66,17 @@ class Linear(nn.Linear):
         return th.from_numpy(y).view(*x.shape[:-1], self.out_features)
 
 
+def normal_(weight: th.Tensor, std: float) -> None:
+    """
+    Draw a weight from a normal distribution around 0, unless it is a shape without numbers: torch takes a second for that.
+
+    :param weight: any shape; on the device "meta" it stays as it is
+    :param std: standard deviation
+    """
+    if not weight.is_meta:
+        nn.init.normal_(weight, std=std)
+
+
 def keep_mask(like: th.Tensor, probability: float) -> th.Tensor:
     """
     Factors of dropout (Srivastava et al., 2014): 0 with `probability`, otherwise what keeps the mean.

@@ -6,7 +6,7 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_dtfm.networks.cpu import Linear
+from sb3_dtfm.networks.cpu import Linear, normal_
 
 # Lowest and highest frequency in rad: higher ones would change faster than a solver's step can follow.
 TAU_FREQUENCIES = (1.0, 100.0)
@@ -103,8 +103,8 @@ class ReturnFilm(nn.Module):
         super().__init__()
         self.hidden = Linear(1 + RETURN_EMBEDDING_DIM, embed_dim)
         self.output = Linear(embed_dim, 2 * embed_dim * n_blocks)
-        nn.init.normal_(self.hidden.weight, std=0.5)
-        nn.init.normal_(self.output.weight, std=0.2)
+        normal_(self.hidden.weight, std=0.5)
+        normal_(self.output.weight, std=0.2)
         nn.init.zeros_(self.hidden.bias)
         nn.init.zeros_(self.output.bias)
 

@@ -1,7 +1,8 @@
 """AdamW, in a few calls for a whole network: one call a parameter is a fifth of a small network's gradient step."""
 
+import inspect
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any
 
 import torch as th
@@ -31,34 +32,22 @@ class FlatTensors:
         self.sizes = [slot_size(tensor) for tensor in self.tensors]
         self._flat = th.empty(0)
 
+    @th.no_grad()
     def flat(self) -> th.Tensor:
         """The tensor that they are views of."""
         first, last = self.tensors[0], self.tensors[-1]
         end = self._flat.data_ptr() + (self._flat.numel() - self.sizes[-1]) * self._flat.element_size()
         if first.data_ptr() != self._flat.data_ptr() or last.data_ptr() != end:
-            self._flat = self.joined(self.tensors, None)
-            for tensor, part in zip(self.tensors, self.split(self._flat), strict=True):
-                tensor.data = part
+            self._flat = first.detach().new_zeros(sum(self.sizes))
+            for tensor, part in zip(self.tensors, self.views(self._flat), strict=True):
+                tensor.data = part.copy_(tensor)
         return self._flat
 
-    def joined(self, tensors: Iterable[th.Tensor], out: th.Tensor | None) -> th.Tensor:
-        """
-        Copies of tensors of the same shapes, laid out alike.
-
-        :param tensors: one for each
-        :param out: memory to take
-        """
-        pieces = []
-        for tensor, size in zip(tensors, self.sizes, strict=True):
-            pieces.append(tensor.detach().flatten())
-            if size > tensor.numel():
-                pieces.append(tensor.new_zeros(size - tensor.numel()))
-        return th.cat(pieces, out=out)
-
-    def split(self, flat: th.Tensor) -> Iterator[th.Tensor]:
+    @th.no_grad()
+    def views(self, flat: th.Tensor) -> list[th.Tensor]:
         """Views of a tensor that is laid out alike, with the tensors' shapes."""
-        for tensor, part in zip(self.tensors, flat.split(self.sizes), strict=True):
-            yield part[: tensor.numel()].view(tensor.shape)
+        parts = zip(self.tensors, flat.split(self.sizes), strict=True)
+        return [part[: tensor.numel()].view(tensor.shape) for tensor, part in parts]
 
 
 def slot_size(tensor: th.Tensor) -> int:
@@ -79,6 +68,11 @@ class FlatAdamW(th.optim.AdamW):
     :param lr: learning rate
     :param weight_decay: of `decayed`
     """
+
+    # torch's own but for a mark for its compiler, which loads the compiler: a second and a half of each start.
+    add_param_group = inspect.unwrap(th.optim.Optimizer.add_param_group)
+    state_dict = inspect.unwrap(th.optim.Optimizer.state_dict)
+    load_state_dict = inspect.unwrap(th.optim.Optimizer.load_state_dict)
 
     # Of a gradient step that changes nothing 1, else 0; a GPU decides by it without a host that waits.
     found_inf: th.Tensor | None = None
@@ -101,6 +95,7 @@ class FlatAdamW(th.optim.AdamW):
         self._weights = FlatTensors(self.parameters)
         self._moments: dict[str, FlatTensors] = {}
         self._memory: th.Tensor | None = None
+        self._parts_of_memory: list[th.Tensor] = []  # one for each parameter
         self._gradient: th.Tensor | None = None  # clipped, for the next step
         self._is_even = True  # all parameters have had as many steps
         self._clipped_parameters = [parameter for parameter in self.parameters if id(parameter) not in apart]
@@ -115,7 +110,7 @@ class FlatAdamW(th.optim.AdamW):
 
     def zero_grad(self, set_to_none: bool = True) -> None:
         """torch's."""
-        super().zero_grad(set_to_none)
+        inspect.unwrap(th.optim.Optimizer.zero_grad)(self, set_to_none)
         self._gradient = None
 
     def clip_gradient(self, max_norm: float) -> th.Tensor:
@@ -132,7 +127,7 @@ class FlatAdamW(th.optim.AdamW):
         norm = clipped.norm()
         if max_norm < math.inf:
             clipped.mul_((max_norm / (norm + 1e-6)).clamp(max=1.0))
-            for parameter, part in zip(self.parameters, self._weights.split(gradient), strict=True):
+            for parameter, part in zip(self.parameters, self._parts_of_memory, strict=True):
                 parameter.grad = part
         return norm
 
@@ -157,6 +152,7 @@ class FlatAdamW(th.optim.AdamW):
             )  # fmt: skip
         steps.copy_(count)
 
+    @th.no_grad()
     def _flat_gradient(self) -> th.Tensor | None:
         """All gradients, (N,), in memory that is used again; None where a parameter has none, as one that is frozen."""
         gradients = [parameter.grad for parameter in self.parameters]
@@ -164,8 +160,10 @@ class FlatAdamW(th.optim.AdamW):
             return None
         weights = self.flat_weights()
         if self._memory is None or self._memory.device != weights.device:
-            self._memory = th.empty_like(weights)
-        return self._weights.joined(gradients, self._memory)  # type: ignore[arg-type]
+            self._memory = th.zeros_like(weights)
+            self._parts_of_memory = self._weights.views(self._memory)
+        th._foreach_copy_(self._parts_of_memory, gradients)  # type: ignore[arg-type]
+        return self._memory
 
     def _flat_moments(self) -> tuple[th.Tensor, ...]:
         """The number of steps of each parameter, and mean and mean square of the gradients, (N,) each."""

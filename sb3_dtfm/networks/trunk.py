@@ -6,7 +6,7 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_dtfm.networks.cpu import Linear, dropout, dropout_add
+from sb3_dtfm.networks.cpu import Linear, dropout, dropout_add, normal_
 from sb3_dtfm.networks.film import ReturnFilm
 
 ALL = slice(None)
@@ -176,12 +176,12 @@ class SequenceTrunk(nn.Module):
     def _initialize(self, module: nn.Module) -> None:
         """GPT-2's initialisation: normal weights of 0.02, and smaller where residual branches add up."""
         if isinstance(module, (nn.Linear, nn.Embedding)):
-            nn.init.normal_(module.weight, std=0.02)
+            normal_(module.weight, std=0.02)
         if isinstance(module, nn.Linear):
             nn.init.zeros_(module.bias)
         if isinstance(module, TransformerBlock):
             for branch_end in (module.attention_out, module.mlp_out):
-                nn.init.normal_(branch_end.weight, std=0.02 / (2 * self.n_layers) ** 0.5)
+                normal_(branch_end.weight, std=0.02 / (2 * self.n_layers) ** 0.5)
 
     def forward(
         self,

@@ -64,8 +64,9 @@ class Normalization(nn.Module):
         by_timestep = return_scaling == "timestep"
         self.register_buffer("return_mean", th.zeros(max_timestep) if by_timestep else None)
         self.register_buffer("return_std", th.ones(max_timestep) if by_timestep else None)
-        unlimited = th.tensor([[-th.inf], [th.inf]]).repeat(1, max_timestep) if clip_return_to_go else None
-        self.register_buffer("return_to_go_range", unlimited)
+        unlimited = th.full((2, max_timestep), th.inf)
+        unlimited[0] = -th.inf
+        self.register_buffer("return_to_go_range", unlimited if clip_return_to_go else None)
         for name, bound in (("action_low", action_space.low), ("action_high", action_space.high)):
             self.register_buffer(name, th.as_tensor(bound, dtype=th.float32), persistent=False)
 

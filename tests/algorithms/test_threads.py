@@ -31,7 +31,8 @@ def test_the_default_is_little_work_and_the_papers_settings_are_not(cheetah_buff
     paper = {**paper_settings("dtfm"), "precision": "float32"}
     for large, settings in ((False, {"policy": "MultiInputPolicy"}), (True, paper)):
         model = DTFM(dataset=cheetah_buffer, **settings)
+        assert (model._n_products() > ONE_THREADS_PRODUCTS) == large
+        model.batch_size = 8
         with FlopCounterMode(display=False) as counter:
             model.learn(1)
         assert model._n_products() == pytest.approx(counter.get_total_flops() / 2, rel=0.25)
-        assert (model._n_products() > ONE_THREADS_PRODUCTS) == large

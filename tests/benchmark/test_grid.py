@@ -410,6 +410,7 @@ def test_a_mistake_ends_in_one_clear_line_before_anything_runs(arguments, messag
     assert not Path("logs").exists()
 
 
+@pytest.mark.slow
 def test_an_interrupted_cell_goes_on_from_its_checkpoint_to_the_same_rows(grid, workplace, monkeypatch):
     """A cell loses nothing that a checkpoint holds."""
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))

@@ -144,7 +144,8 @@ def test_the_seed_is_the_environments_too(file, cheetah_buffer):
     np.testing.assert_array_equal(*firsts)
 
 
-def test_own_returns_are_expected_ones_as_the_datasets_are(file, cheetah_buffer):
+def test_own_returns_are_expected_ones_as_the_datasets_are(file, cheetah_buffer, monkeypatch):
+    monkeypatch.setattr("sb3_dtfm.data.expected.N_TIMESTEPS", 100)
     model = OnlineDTFM.load(file, make_venv(), dataset=cheetah_buffer, return_steps=2, **ONLINE)
     model.set_dataset(cheetah_buffer)
     model.replay_buffer = cheetah_buffer.best(best_share=0.2)
