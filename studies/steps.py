@@ -1,11 +1,13 @@
 """
-What a gradient step takes beside its matrix products alone: docs/performance.md's table.
+What a gradient step takes beside its matrix products alone: docs/performance.md's tables. On one core:
 
-    OMP_NUM_THREADS=1 python studies/steps.py                      # on one core, a minute
-    OMP_NUM_THREADS=1 python studies/steps.py --before CHECKOUT    # in turn with another version of this package
+    OMP_NUM_THREADS=1 python studies/steps.py defaults             # what the data decide, a minute
+    OMP_NUM_THREADS=1 python studies/steps.py sizes                # larger and smaller ones
+    OMP_NUM_THREADS=1 python studies/steps.py sizes --before CHECKOUT --d3rlpy .venv-peers/bin/python
 
-Every measurement has a process of its own. Products are those that a step computes, of the same shapes and layouts, one
-after the other and without anything else.
+in turn with another version of this package, and with d3rlpy's Decision Transformer of the same width and depth, of which a
+step has 64 windows of 20 steps. Every measurement has a process of its own. Products are those that a step computes, of the
+same shapes and layouts, one after the other and without anything else.
 """
 
 import argparse
@@ -16,7 +18,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -25,22 +27,65 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_dtfm.algorithms import ALGORITHMS, OfflineSequenceAlgorithm
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
+from sb3_dtfm.zoo.registration import policy_of
+
+
+class Step(NamedTuple):
+    """
+    What a gradient step is of.
+
+    :param algo: "dt" or "dtfm"
+    :param observation_dim: numbers of an observation
+    :param action_dim: numbers of an action
+    :param batch_size: windows
+    :param context_length: steps of a window
+    :param policy_kwargs: the policy's options
+    """
+
+    algo: str
+    observation_dim: int
+    action_dim: int
+    batch_size: int
+    context_length: int
+    policy_kwargs: dict[str, Any]
+
 
 AGENT = dict(calm_units=True, chunk_size=1, timestep_embedding=False, dropout=0.0)
 MEAN = dict(n_solver_steps=0, regression_coef=1.0)
+CONDITIONED = dict(return_conditioning=True, return_range=False)  # which earlier versions always were
 UNCONDITIONED = dict(return_conditioning=False, return_range=False)
 PEOPLE = dict(UNCONDITIONED, chunk_size=8, timestep_embedding=True, n_solver_steps=10, regression_coef=0.0)
-PAPER = dict(PEOPLE, chunk_size=1, embed_dim=256, n_layers=10, flow_hidden_dim=512, dropout=0.1)
-# Name: algorithm, numbers of an observation and an action, batch, context, the policy's options: what the data decide.
-STEPS: dict[str, tuple[str, int, int, int, int, dict[str, Any]]] = {
-    "one agent, DT": ("dt", 11, 3, 256, 1, {**AGENT, **UNCONDITIONED}),
-    "one agent, DTFM": ("dtfm", 11, 3, 256, 1, {**AGENT, **MEAN, **UNCONDITIONED}),
-    "several agents, DTFM": ("dtfm", 17, 6, 256, 1, {**AGENT, **MEAN}),
-    "demonstrations, DTFM": ("dtfm", 29, 7, 256, 1, dict(PEOPLE, dropout=0.0)),
-    "few demonstrations, DTFM": ("dtfm", 29, 7, 64, 1, dict(PEOPLE, dropout=0.2)),
-    "paper's size, one token, DTFM": ("dtfm", 17, 6, 64, 20, PAPER),
-    "paper's size, three tokens, DTFM": ("dtfm", 17, 6, 64, 20, dict(PAPER, tokens_per_step=3)),
+DEFAULTS: dict[str, Step] = {
+    "one agent, DT": Step("dt", 11, 3, 256, 1, {**AGENT, **UNCONDITIONED}),
+    "one agent, DTFM": Step("dtfm", 11, 3, 256, 1, {**AGENT, **MEAN, **UNCONDITIONED}),
+    "several agents, DTFM": Step("dtfm", 17, 6, 256, 1, {**AGENT, **MEAN}),
+    "demonstrations, DTFM": Step("dtfm", 29, 7, 256, 1, dict(PEOPLE, dropout=0.0)),
+    "few demonstrations, DTFM": Step("dtfm", 29, 7, 64, 1, dict(PEOPLE, dropout=0.2)),
 }
+SMALL = dict(
+    embed_dim=128, n_layers=3, flow_hidden_dim=128, tokens_per_step=1, chunk_size=1, timestep_embedding=True,
+    calm_units=True, n_solver_steps=3, regression_coef=0.0,
+)  # fmt: skip
+WIDE = dict(SMALL, flow_hidden_dim=512, dropout=0.1)
+PAPER = dict(WIDE, embed_dim=256, n_layers=10)
+# Those that issues and papers name, and both versions know.
+SIZES: dict[str, Step] = {
+    "width 128 x 3, one step, batch 64": Step("dtfm", 17, 6, 64, 1, dict(SMALL, dropout=0.2)),
+    "the same, chunks of 8": Step("dtfm", 29, 7, 64, 1, dict(SMALL, dropout=0.0, chunk_size=8)),
+    "the same, five steps": Step("dtfm", 17, 6, 64, 5, dict(SMALL, dropout=0.0, film_return_to_go=True)),
+    "the same, one step, batch 256": Step("dtfm", 17, 6, 256, 1, dict(SMALL, dropout=0.2)),
+    "width 128 x 3, 20 steps, head 512": Step("dtfm", 17, 6, 64, 20, WIDE),
+    "the same, head 128": Step("dtfm", 17, 6, 64, 20, dict(WIDE, flow_hidden_dim=128)),
+    "width 256 x 10, 20 steps, head 512": Step("dtfm", 17, 6, 64, 20, PAPER),
+    "the same, three tokens a step": Step("dtfm", 17, 6, 64, 20, dict(PAPER, tokens_per_step=3)),
+}
+STEPS = {**DEFAULTS, **SIZES}
+COLUMNS = {
+    "gflop": "GFLOP", "products": "products, ms", "step": "step, ms", "ratio": "step / products",
+    "auto": "before, auto, ms", "auto / now": "/ step", "float32": "before, float32, ms", "float32 / now": "/ step",
+    "d3rlpy": "d3rlpy's DT, ms", "d3rlpy / now": "/ step",
+}  # fmt: skip
+HERE = Path(__file__).resolve().parents[1]
 PRODUCTS = [getattr(th.ops.aten, name).default for name in ("mm", "addmm", "bmm", "baddbmm")]
 
 
@@ -72,25 +117,28 @@ class Products(TorchDispatchMode):
         return 1e3 * statistics.median(times)
 
 
-def make_model(name: str) -> OfflineSequenceAlgorithm:
+def make_model(name: str, precision: str = "float32") -> OfflineSequenceAlgorithm:
     """A model of random data with nothing left to decide."""
-    algo, observation_dim, action_dim, batch_size, context_length, policy_kwargs = STEPS[name]
+    step = STEPS[name]
     rng = np.random.default_rng(0)
+    shapes = (1000, step.observation_dim), (1000, step.action_dim)
     episodes = [
-        Trajectory(rng.normal(size=(1000, observation_dim)), rng.uniform(-1, 1, (1000, action_dim)), rng.normal(size=1000))
-        for _ in range(10)
+        Trajectory(rng.normal(size=shapes[0]), rng.uniform(-1, 1, shapes[1]), rng.normal(size=1000)) for _ in range(10)
     ]
-    dataset = TrajectoryBuffer.from_trajectories(episodes, spaces.Box(-1, 1, (action_dim,)))
-    given = dict(batch_size=batch_size, context_length=context_length, return_weight=0.0, return_steps=0)
-    return ALGORITHMS[algo](
-        "MultiInputPolicy", dataset=dataset, policy_kwargs=policy_kwargs, device="cpu", seed=0, **given
+    dataset = TrajectoryBuffer.from_trajectories(episodes, spaces.Box(-1, 1, (step.action_dim,)))
+    known = policy_of(step.algo).parameter_names()
+    decided = {key: value for key, value in CONDITIONED.items() if key in known}
+    given = dict(batch_size=step.batch_size, context_length=step.context_length, return_weight=0.0, ema_decay=0.999)
+    return ALGORITHMS[step.algo](
+        "MultiInputPolicy", dataset=dataset, policy_kwargs={**decided, **step.policy_kwargs}, precision=precision,
+        return_steps=0 if decided else None, device="cpu", seed=0, **given,
     )  # fmt: skip
 
 
-def measure(name: str) -> dict[str, float]:
+def measure(name: str, precision: str) -> dict[str, float]:
     """Median processor time of a step of `learn`, and of its products before and after: other jobs slow both."""
-    n_steps = 10 if name.startswith("paper") else 200
-    model = make_model(name)
+    n_steps = 10 if STEPS[name].context_length == 20 else 200
+    model = make_model(name, precision)
     with Products() as products:
         model.learn(1, log_interval=None)
     before = products.milliseconds(n_steps // 5)
@@ -101,42 +149,61 @@ def measure(name: str) -> dict[str, float]:
     return {"step": step, "products": min(before, after), "gflop": products.gflop()}
 
 
-def run(name: str, checkout: Path) -> dict[str, float]:
+def run(name: str, checkout: Path, precision: str = "float32") -> dict[str, float]:
     """A measurement in a process of its own."""
-    command = [sys.executable, __file__, "--one", name]
+    command = [sys.executable, __file__, "one", "--name", name, "--precision", precision]
     environment = {**os.environ, "PYTHONPATH": str(checkout)}
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=environment)
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def run_d3rlpy(python: Path, step: Step) -> float:
+    """Median processor time of a step of d3rlpy's Decision Transformer, milliseconds."""
+    size = [str(step.policy_kwargs[key]) for key in ("embed_dim", "n_layers")]
+    command = [str(python), str(HERE / "studies" / "d3rlpy_worker.py"), "train", *size, "10"]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])["processor_ms"]
+
+
+def line(name: str, options: argparse.Namespace) -> str:
+    """A row of the table: medians of all runs, and of the ratios of runs that were made in turn."""
+    found: dict[str, list[float]] = {}
+
+    def keep(**values: float) -> None:
+        for key, value in values.items():
+            found.setdefault(key, []).append(value)
+
+    for _ in range(options.repeats):
+        now = run(name, HERE)
+        keep(**now, ratio=now["step"] / now["products"])
+        if options.before:
+            for precision in ("auto", "float32"):
+                before = run(name, options.before.resolve(), precision)["step"]
+                keep(**{precision: before, f"{precision} / now": before / now["step"]})
+        if options.d3rlpy and STEPS[name].context_length == 20:
+            peer = run_d3rlpy(options.d3rlpy.absolute(), STEPS[name])
+            keep(d3rlpy=peer, **{"d3rlpy / now": peer / now["step"]})
+    columns = [f"{statistics.median(found[key]):.2f}" if key in found else "-" for key in COLUMNS]
+    return f"| {name} | {' | '.join(columns)} |"
 
 
 def main() -> None:
     """See the top."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("defaults", "sizes", "one"))
     parser.add_argument("--before", type=Path, metavar="CHECKOUT")
+    parser.add_argument("--d3rlpy", type=Path, metavar="PYTHON", help="of an environment that has d3rlpy")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--one", help=argparse.SUPPRESS)
+    parser.add_argument("--name", help=argparse.SUPPRESS)
+    parser.add_argument("--precision", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.one:
-        print(json.dumps(measure(options.one)))
+    if options.what == "one":
+        print(json.dumps(measure(options.name, options.precision)))
         return
-    here = Path(__file__).resolve().parents[1]
-    print("| data | GFLOP | products, ms | step, ms | step / products | before, ms | before / now |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
-    for name in STEPS:
-        runs: list[list[dict[str, float]]] = [[], []]
-        for _ in range(options.repeats):
-            for checkout, found in zip((here, options.before), runs, strict=True):
-                if checkout is not None:
-                    found.append(run(name, checkout.resolve()))
-        now = {key: statistics.median(each[key] for each in runs[0]) for key in runs[0][0]}
-        ratio = statistics.median(each["step"] / each["products"] for each in runs[0])
-        line = f"| {name} | {now['gflop']:.2f} | {now['products']:.2f} | {now['step']:.2f} | {ratio:.2f} |"
-        if runs[1]:
-            before = statistics.median(each["step"] for each in runs[1])
-            faster = statistics.median(old["step"] / new["step"] for new, old in zip(*runs, strict=True))
-            print(f"{line} {before:.2f} | {faster:.2f} |", flush=True)
-        else:
-            print(f"{line} - | - |", flush=True)
+    print(f"| | {' | '.join(COLUMNS.values())} |")
+    print("| --- " * (1 + len(COLUMNS)) + "|")
+    for name in {"defaults": DEFAULTS, "sizes": SIZES}[options.what]:
+        print(line(name, options), flush=True)
 
 
 if __name__ == "__main__":
