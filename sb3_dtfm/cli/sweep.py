@@ -106,9 +106,7 @@ def _parser() -> argparse.ArgumentParser:
     argument("--points", type=_at_least(2), default=9, metavar="N", help="how many then; 9 by default")
     argument("--episodes", type=_at_least(1), default=10, metavar="N", help="for each return; 10 by default")
     argument("--n-envs", type=_at_least(1), default=10, metavar="N", help="environments side by side; 10 by default")
-    argument(
-        "--acting", nargs="+", default=[], metavar="KEY:VALUE", help="for example n_solver_steps:10; as saved by default"
-    )
+    argument("--acting", nargs="+", default=[], metavar="KEY:VALUE", help="for example flow_steps:10; as saved by default")
     argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="to import first: they register tasks")
     argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="as in train")
     argument("--seed", type=int, default=0, help="of the initial states, the same for each return and model")

@@ -11,23 +11,23 @@ CLIP, SMALLEST_STD = 10.0, 1e-6
 BLOCK_BYTES = 2**18
 # A variance below this share of the mean square is computed again, without the mean.
 CANCELLATION = 1e-5
-# The calmest share of the episodes decides the unit of a dimension, which is at least this share of its standard deviation.
-CALM_EPISODES = 0.25
-SMALLEST_UNIT = 0.1
+# The robust deviation is this quantile of the episodes' deviations, and at least this share of the standard deviation.
+ROBUST_QUANTILE = 0.25
+SMALLEST_ROBUST_STD = 0.1
 
 
 class Statistics(NamedTuple):
     """
     What inputs are normalised by.
 
-    Shapes: observation_mean (O,) and observation_std (O,) over all steps, float64; observation_unit (O,), the same as the
-    standard deviation but where some episodes spread much wider than others, see :meth:`EpisodeTable.statistics`;
+    Shapes: observation_mean (O,) and observation_std (O,) over all steps, float64; observation_robust_std
+    (O,), the lower quartile of the episodes' standard deviations, see :meth:`EpisodeTable.statistics`;
     return_scale, the largest absolute return-to-go in environment reward units.
     """
 
     observation_mean: np.ndarray
     observation_std: np.ndarray
-    observation_unit: np.ndarray
+    observation_robust_std: np.ndarray
     return_scale: float
 
     def normalize(self, observations: th.Tensor) -> th.Tensor:
@@ -72,17 +72,17 @@ class EpisodeTable(NamedTuple):
         Those of all steps of all episodes of the table, without a look at the steps (Chan et al., 1979).
 
         Where agents of several kinds are mixed, one that rolls on its back stretches the standard deviation of the pitch
-        tenfold, and what the others do with theirs is lost in the input's third digit. So the unit is what a calm episode
-        spreads: the root mean square distance of its steps from the middle episode's mean.
+        tenfold, and the pitch of the others is lost in the input's third digit. The robust deviation is the lower quartile
+        over episodes of the root mean square distance of an episode's steps from the median episode's mean.
         """
         n_steps = self.lengths.sum()
         mean = self.lengths @ self.observation_means / n_steps
         squares = self.observation_squares.sum(axis=0) + self.lengths @ np.square(self.observation_means - mean)
         std = np.sqrt(squares / n_steps)
         offsets = self.observation_means - np.median(self.observation_means, axis=0)
-        spreads = np.sqrt(self.observation_squares / self.lengths[:, None] + np.square(offsets))
-        unit = np.clip(np.quantile(spreads, CALM_EPISODES, axis=0), SMALLEST_UNIT * std, std)
-        return Statistics(mean, std, unit, float(self.return_scales.max()))
+        deviations = np.sqrt(self.observation_squares / self.lengths[:, None] + np.square(offsets))
+        robust = np.clip(np.quantile(deviations, ROBUST_QUANTILE, axis=0), SMALLEST_ROBUST_STD * std, std)
+        return Statistics(mean, std, robust, float(self.return_scales.max()))
 
 
 def moments(observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
