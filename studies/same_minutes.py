@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_dtfm.benchmark.report.runs import Run, read_studies
+from sb3_dtfm.benchmark.report.runs import Run, read_studies, row_value
 
 N_LAST = 3
 
@@ -32,9 +32,8 @@ def minutes_a_step(runs: list[Run]) -> float:
 def reached(run: Run, n_steps: float) -> str:
     """Return, or success in percent, after so many gradient steps."""
     rows = [row for row in run.evaluations if row["step"] <= n_steps][-N_LAST:]
-    if run.counts_success:
-        return f"{np.mean([row['successes'] for row in rows]):.0%}"
-    return f"{np.mean([row['returns'] for row in rows]):,.0f}"
+    mean = np.mean([row_value(row) for row in rows])
+    return f"{mean:.0f}%" if run.counts_success else f"{mean:,.0f}"
 
 
 def main() -> None:
