@@ -1,7 +1,7 @@
 """
 What a study's runs had reached when those of another one, which need fewer minutes, were finished: same tasks, same data.
 
-    python studies/same_minutes.py results/one-token results/small --labels one-token ""
+    python studies/same_minutes.py results/one-token.csv results/small.csv --labels one-token ""
 
 A line for each task and algorithm: the means over the last three evaluations that were made within these minutes of
 training, seed by seed. The longer runs are cut short, so their learning rate had not come down yet. Other jobs can only make

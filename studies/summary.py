@@ -55,13 +55,13 @@ def about(path: Path) -> dict[str, str]:
     return {
         "study": f"[{path.stem}]({path.name})",
         "algorithms": _first([algo.upper() for algo in algos], 4),
-        "seeds": str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}",
+        "seeds": str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]}-{seeds[-1]}",
         "commits": _first(commits, 2),
     }
 
 
 def _first(names: Sequence[str], n: int) -> str:
-    return ", ".join(names) if len(names) <= n else f"{', '.join(names[:2])} and {len(names) - 2} more"
+    return ", ".join(names) if len(names) <= n else f"{', '.join(names[:2])}, +{len(names) - 2}"
 
 
 def lines(path: Path) -> Iterable[dict[str, str]]:
@@ -89,7 +89,7 @@ def lines(path: Path) -> Iterable[dict[str, str]]:
 
 
 def table(path: Path) -> str:
-    """Markdown, without the columns that say nothing of these rows."""
+    """Markdown, without the columns that say nothing of these results."""
     found = list(lines(path))
     return _markdown(found, [name for name in found[0] if any(line[name] != NONE for line in found)])
 
@@ -103,5 +103,4 @@ def _markdown(found: Sequence[dict[str, str]], header: Sequence[str]) -> str:
 
 if __name__ == "__main__":
     paths = [Path(argument) for argument in sys.argv[1:]]
-    found = [about(path) for path in paths]
-    print(table(*paths) if len(paths) == 1 else _markdown(found, list(found[0])))
+    print(table(*paths) if len(paths) == 1 else _markdown(each := [about(path) for path in paths], list(each[0])))

@@ -60,7 +60,7 @@ def _json(text: str) -> dict[str, Any]:
 
 
 def _versions(text: str) -> dict[str, str]:
-    return {name: version for name, _, version in (each.rpartition(" ") for each in text.split("; "))}
+    return dict(each.rsplit(" ", 1) for each in text.split("; "))
 
 
 EXPECTED = {
@@ -199,7 +199,7 @@ def _read_line(cells: dict[str, str]) -> Result:
 
 def read_results(paths: Iterable[str | os.PathLike[str]]) -> dict[str, list[Result]]:
     """
-    Results by study: a folder of rows, or a table, in a folder that is named is a study; what is named itself is the study "".
+    Results by study: a folder below one that is named, or a table in it, is a study; what is named itself is the study "".
 
     :param paths: tables, files of rows, and folders with `*.csv` in them, or `*.jsonl` in them or below them
     :raises FileNotFoundError: one of them does not exist

@@ -27,8 +27,8 @@ def main(argv: Sequence[str]) -> None:
         prog="sb3-dtfm report",
         description="Write report.md and figures from rows of `sb3-dtfm benchmark`, or from CSV tables of them.",
         epilog="Tables in the folders that are named, and folders below these, are studies: each has its own part of the "
-        "report. Results of folders and files that are named themselves are put together. Settings that a label changed are compared with runs without it, of the "
-        "same study if it has some.",
+        "report. Results of folders and files that are named themselves are put together. Settings that a label changed are "
+        "compared with runs without it, of the same study if it has some.",
     )
     parser.add_argument("results", nargs="+", help="CSV tables, files of rows, or folders of either")
     argument = parser.add_argument
