@@ -42,7 +42,7 @@ def check_batch_size(batch_size: int) -> None:
 
 
 @contextlib.contextmanager
-def first_of_each_machine_first() -> Iterator[None]:
+def local_rank_zero_first() -> Iterator[None]:
     """Let the first process of each machine download what the others then find on disk."""
     if n_processes() == 1:
         yield
@@ -139,7 +139,7 @@ class DataParallel:
         dist.all_reduce(means)
         return dict(zip(values, means, strict=True))
 
-    def from_first(self, number: int) -> int:
+    def broadcast(self, number: int) -> int:
         """
         Process 0's number; the others wait for it.
 

@@ -17,7 +17,7 @@ PRECISIONS = ("auto", "float32", "bfloat16")
 # Rows and repetitions that decide which of them is faster on a CPU.
 TIMED_ROWS, N_TIMES = 512, 5
 # Multiplications of a gradient step up to which one thread is as quick as two, which wait for one another.
-ONE_THREADS_PRODUCTS = 3e9
+ONE_THREADS_MACS = 3e9
 
 
 def learning_rate_factor(schedule: str, step: int, progress: float, warmup_steps: int = 0) -> float:
@@ -100,14 +100,14 @@ def autocast(precision: str, device: th.device) -> th.autocast:
 
 
 @contextlib.contextmanager
-def threads_that_pay(n_products: float) -> Iterator[None]:
+def limit_threads(n_macs: float) -> Iterator[None]:
     """
     One thread for little work; as many as ever for more, and where `OMP_NUM_THREADS` says how many.
 
-    :param n_products: multiplications of the work
+    :param n_macs: multiplications of the work
     """
     n_threads = th.get_num_threads()
-    if n_products > ONE_THREADS_PRODUCTS or n_threads == 1 or "OMP_NUM_THREADS" in os.environ:
+    if n_macs > ONE_THREADS_MACS or n_threads == 1 or "OMP_NUM_THREADS" in os.environ:
         yield
         return
     th.set_num_threads(1)

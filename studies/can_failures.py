@@ -71,9 +71,9 @@ def share_that_lets_go(policy: SequencePolicy, observation: dict[str, np.ndarray
     """
     rows = np.zeros(N_DRAWS, int)
     repeated = {key: value[None][rows] for key, value in observation.items()}
-    context, hidden = policy.look(repeated, tuple(each[None][rows] for each in state), np.zeros(N_DRAWS, bool))
-    noise = np.random.default_rng(0).standard_normal((N_DRAWS, policy.check_steerable()))
-    actions, _ = policy.act_from_noise(context, hidden, noise)
+    context, hidden = policy.encode(repeated, tuple(each[None][rows] for each in state), np.zeros(N_DRAWS, bool))
+    noise = np.random.default_rng(0).standard_normal((N_DRAWS, policy.check_noise_actions()))
+    actions, _ = policy.decode(context, hidden, noise)
     return float((actions[:, :, GRIPPER] < 0).any(axis=1).mean())
 
 

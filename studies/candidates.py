@@ -40,7 +40,7 @@ def choose_together(policies: list[SequencePolicy], draws_of_all: bool) -> None:
         for each in policies:
             assert each.critic is not None
             gains += each.critic.gains(
-                each.normalization.scale_observation(seen), candidates[..., : each.n_valued * each.action_dim]
+                each.normalization.scale_observation(seen), candidates[..., : each.critic_horizon * each.action_dim]
             )
         return candidates[th.arange(len(rows)), gains.argmax(dim=1)]
 
@@ -51,7 +51,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", nargs="+", type=Path)
     parser.add_argument("--n", type=int, default=8, help="candidates; 8 by default")
-    parser.add_argument("--noise", type=float, default=1.0, help="candidate_noise; 1 by default")
+    parser.add_argument("--noise", type=float, default=1.0, help="sample_noise_std; 1 by default")
     parser.add_argument("--env", default="robosuite/Can-v0", help="robosuite/Can-v0 by default")
     parser.add_argument("--together", choices=("models", "critics"))
     parser.add_argument("--first", type=int, default=0, help="final episode to begin with")
@@ -60,7 +60,7 @@ def main() -> None:
     th.set_num_threads(1)
     models = [DTFM.load(path, device="cpu") for path in options.models]
     for model in models:
-        model.policy.set_acting(n_candidates=options.n, candidate_noise=options.noise)
+        model.policy.set_acting(n_action_samples=options.n, sample_noise_std=options.noise)
     if options.together:
         choose_together([model.policy for model in models], options.together == "models")
     envs = make_seeded_envs(options.env, SETTINGS, N_ENVS)

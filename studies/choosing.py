@@ -32,7 +32,7 @@ def change(critic: Critic, way: str) -> None:
     def gains(observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
         if way == "margin":
             found = plain(observations, actions)
-            found[:, 1:] -= critic.spread
+            found[:, 1:] -= critic.advantage_std
             return found
         pairs = th.cat((observations.unsqueeze(1).expand(-1, actions.shape[1], -1), actions), dim=-1)
         values = th.stack([q(pairs).squeeze(-1) for q in critic.q_target])
@@ -50,7 +50,7 @@ def main() -> None:
     parser.add_argument("--target-return", type=float, required=True)
     parser.add_argument("--gym-packages", nargs="+", default=[])
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS)
-    parser.add_argument("--acting", nargs="+", default=["n_candidates:8"], help="as in sb3-dtfm sweep")
+    parser.add_argument("--acting", nargs="+", default=["n_action_samples:8"], help="as in sb3-dtfm sweep")
     parser.add_argument("--first", type=int, default=1000)
     parser.add_argument("--episodes", type=int, default=300)
     options = parser.parse_args()
@@ -64,7 +64,7 @@ def main() -> None:
     for way in options.ways:
         policy = (model := DTFM.load(options.model, device="cpu")).policy
         assert policy.critic is not None
-        policy.set_acting(**(acting if way != "one" else {"n_candidates": 1}))
+        policy.set_acting(**(acting if way != "one" else {"n_action_samples": 1}))
         change(policy.critic, way)
         found = evaluate(model, envs, states, lambda n: None)
         successes = None if found.successes is None else int(np.sum(found.successes))

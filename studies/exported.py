@@ -21,7 +21,7 @@ from deploy import Policy
 # Name: algorithm, width, layers, width of the flow head, tokens a step, context.
 SMALL = ("small profile", 128, 3, 128, 1, 5)
 PAPER = ("paper profile", 256, 10, 512, 3, 20)
-FEW, MANY, ONE = {"n_solver_steps": 3}, {"n_solver_steps": 50}, {"solver": "one_step"}
+FEW, MANY, ONE = {"flow_steps": 3}, {"flow_steps": 50}, {"flow_solver": "one_step"}
 WAYS = [
     (SMALL, "dt", {}),
     (SMALL, "dtfm", FEW),

@@ -32,7 +32,7 @@ from sb3_dtfm.benchmark.report.runs import Group, Run, read_studies, row_value
 from sb3_dtfm.benchmark.report.statistics import student_t
 from sb3_dtfm.benchmark.rows import Cell, Row, read_rows, write_row
 from sb3_dtfm.files import read_run
-from sb3_dtfm.finetuning import STEERED
+from sb3_dtfm.finetuning import FINETUNED
 from sb3_dtfm.recording.loading import load_agent
 
 N_EPISODES, N_ENVS = 100, 10
@@ -43,14 +43,14 @@ def measure(run: Path, before: Path, like: Row, label: str, output: Path) -> Non
     """
     Write rows of what a run began with, and of what it came to.
 
-    :param run: folder of a run of `finetune`, `--algo dtfm` or of a steered model that decides on single actions
+    :param run: folder of a run of `finetune`, `--algo dtfm` or of a fine-tuned model with n_action_steps=1
     :param before: folder of the run that it went on from
     :param like: a row of the model before
     :param label: of the rows
     :param output: folder for the files
     """
     (folder,) = (path.parent for path in run.glob("*/config.yml"))
-    if run.parent.name == STEERED and load_agent(STEERED, run / f"{folder.name}.zip", "cpu").policy.n_action_steps > 1:
+    if run.parent.name == FINETUNED and load_agent(FINETUNED, run / f"{folder.name}.zip", "cpu").policy.n_action_steps > 1:
         raise SystemExit(f"{run}: its timesteps are decisions of several actions; rows have the environment's steps.")
     settings = {**like["settings"], **read_run(before / folder.name), **read_run(folder)}
     settings.pop("callback", None)

@@ -27,15 +27,15 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 from sb3_dtfm import DTFM
 from sb3_dtfm.benchmark.provenance import commit, hardware, versions
 from sb3_dtfm.envs import ReturnToGoWrapper
-from sb3_dtfm.finetuning import CorrectionVecEnv, NoiseActionVecEnv
+from sb3_dtfm.finetuning import ResidualActionVecEnv, NoiseActionVecEnv
 from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
-from sb3_dtfm.zoo.finetuning import leave_a_choice
+from sb3_dtfm.zoo.finetuning import keep_one_action
 from sb3_dtfm.zoo.registration import finetuning_config, packaged_config
 
 # Beside those of the trunk and the head, what the settings of a task say about a model.
 OF_THE_MODEL = ("context_length", "ema_decay", "policy_kwargs")
 VEC_ENVS: dict[str, type[VecEnv]] = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}
-WAYS = {"sac": (SAC, NoiseActionVecEnv), "ppo": (PPO, CorrectionVecEnv)}
+WAYS = {"sac": (SAC, NoiseActionVecEnv), "ppo": (PPO, ResidualActionVecEnv)}
 
 
 def settings_of(path: Path, env_id: str) -> dict[str, Any]:
@@ -151,7 +151,7 @@ def measure_algorithm(algo: str, env_id: str, n_envs: int, vec_env: str, seconds
         raise SystemExit(f"--algo {algo} --env {env_id}: packaged settings name {path}, not {wrapper_class.__name__}.")
     for what in ("wrapped", "learning"):
         model = make_model(env_id)
-        leave_a_choice(model.policy, wrapper_class is CorrectionVecEnv)
+        keep_one_action(model.policy, wrapper_class is ResidualActionVecEnv)
         envs: FrozenPolicyVecEnv = wrapper_class(make_envs(env_id, n_envs, vec_env), model, **arguments)
         row = {"what": what, "n_action_steps": model.policy.n_action_steps}
         if what == "wrapped":
@@ -173,8 +173,8 @@ def measure_wrapped(envs: FrozenPolicyVecEnv, seconds: float) -> dict[str, Any]:
     timed = Timed(
         {
             "environment": (envs.venv, "step_wait"),
-            "trunk and context": (envs.policy, "look"),
-            "head": (envs.policy, "act_from_noise"),
+            "trunk and context": (envs.policy, "encode"),
+            "head": (envs.policy, "decode"),
             "steps of a chunk": (envs, "_pass"),
         }
     )

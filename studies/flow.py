@@ -46,7 +46,7 @@ def main() -> None:
         seed=0,
         device="cpu",
     )
-    flow = dict(flow_hidden_dim=64, flow_n_layers=2, one_step=False)
+    flow = dict(flow_hidden_dim=64, flow_n_layers=2, one_step_policy=False)
     models = {
         algorithm: algorithm("MultiInputPolicy", **settings, policy_kwargs={**TRUNK, **kwargs}).learn(N_STEPS[algorithm])
         for algorithm, kwargs in ((DTFM, flow), (DT, {}))

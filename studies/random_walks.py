@@ -8,7 +8,7 @@ and none of those that begin where a model will have to begin gets there.
     sb3-dtfm benchmark $(python studies/random_walks.py arguments) --seeds 0 1 2 --algo dt dtfm --label plain \
         -params "policy_kwargs:dict(chunk_size=4,dropout=0.0)"
     sb3-dtfm benchmark $(python studies/random_walks.py arguments) --seeds 0 1 2 --algo dtfm --label critic \
-        -params "policy_kwargs:dict(chunk_size=4,dropout=0.0,critic_steps=10,expectile=0.9,gamma=0.98,n_candidates=8)"
+        -params "policy_kwargs:dict(chunk_size=4,dropout=0.0,critic_steps=10,expectile=0.9,gamma=0.98,n_action_samples=8)"
     python studies/random_walks.py plot --dt dt.zip --dtfm dtfm.zip
     OMP_NUM_THREADS=1 python studies/random_walks.py cost --dtfm dtfm.zip
 """
@@ -98,12 +98,12 @@ def cost(model: DTFM) -> None:
     env = make_seeded_envs(ENV_ID, {"env_wrapper": wrapper, "env_kwargs": ENV_KWARGS}, n_envs=1)
     milliseconds: dict[int, list[float]] = {n: [] for n in CANDIDATES}
     for seed in range(N_REPEATS):
-        for n_candidates, times in milliseconds.items():
-            model.policy.set_acting(n_candidates=n_candidates)
+        for n_action_samples, times in milliseconds.items():
+            model.policy.set_acting(n_action_samples=n_action_samples)
             times.append(action_ms(model, env, seed))
     print("| candidates | ms an action |\n| --- | --- |")
-    for n_candidates, times in milliseconds.items():
-        print(f"| {n_candidates} | {np.median(times):.2f} |")
+    for n_action_samples, times in milliseconds.items():
+        print(f"| {n_action_samples} | {np.median(times):.2f} |")
 
 
 def main() -> None:
@@ -117,9 +117,9 @@ def main() -> None:
     if options.what == "record":
         record(options.episodes or 1000)
     elif options.what == "plot":
-        alone, guided = DTFM.load(options.dtfm), DTFM.load(options.dtfm)
-        alone.policy.set_acting(n_candidates=1)
-        models = {"DT": DT.load(options.dt), "DTFM": alone, "DTFM with critic": guided}
+        alone, best_of_n = DTFM.load(options.dtfm), DTFM.load(options.dtfm)
+        alone.policy.set_acting(n_action_samples=1)
+        models = {"DT": DT.load(options.dt), "DTFM": alone, "DTFM with critic": best_of_n}
         plot(models, options.episodes or 50, options.output)
     elif options.what == "cost":
         cost(DTFM.load(options.dtfm, device="cpu"))

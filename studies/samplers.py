@@ -41,8 +41,8 @@ def evaluate_ways(options: argparse.Namespace) -> None:
     seeds = range(options.seed, options.seed + options.episodes)
     noise = model.policy.noise_table.clone()
     for way, deviation in product(options.ways, options.noise_std):
-        solver, n_solver_steps, kv_cache = WAYS[way]
-        model.policy.set_acting(solver=solver, n_solver_steps=n_solver_steps, kv_cache=kv_cache)
+        solver, flow_steps, kv_cache = WAYS[way]
+        model.policy.set_acting(flow_solver=solver, flow_steps=flow_steps, kv_cache=kv_cache)
         model.policy.noise_table.copy_(deviation * noise)
         with tqdm(total=options.episodes, unit="episode", leave=False, disable=None) as progress:
             episodes = evaluate(model, vec_env, seeds, lambda n_done, bar=progress: bar.update(n_done - bar.n))

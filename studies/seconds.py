@@ -95,7 +95,7 @@ class Cell:
         """
         episodes = evaluate(model, self.vec_env, range(TRAINING_STATES, TRAINING_STATES + N_EPISODES))
         described: Row = dict(
-            commit=provenance.commit(), versions=provenance.versions(), solver=None, n_solver_steps=None,
+            commit=provenance.commit(), versions=provenance.versions(), flow_solver=None, flow_steps=None,
             hardware={**provenance.hardware(th.device("cpu")), "threads": 1},
         )  # fmt: skip
         identity = {**self.job.row, "algo": self.algo}

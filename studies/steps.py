@@ -50,11 +50,11 @@ class Step(NamedTuple):
     policy_kwargs: dict[str, Any]
 
 
-AGENT = dict(calm_units=True, chunk_size=1, timestep_embedding=False, dropout=0.0)
-MEAN = dict(n_solver_steps=0, regression_coef=1.0)
+AGENT = dict(observation_scaling="robust", chunk_size=1, timestep_embedding=False, dropout=0.0)
+MEAN = dict(flow_steps=0, regression_coef=1.0)
 CONDITIONED = dict(return_conditioning=True, return_range=False)  # which earlier versions always were
 UNCONDITIONED = dict(return_conditioning=False, return_range=False)
-PEOPLE = dict(UNCONDITIONED, chunk_size=8, timestep_embedding=True, n_solver_steps=10, regression_coef=0.0)
+PEOPLE = dict(UNCONDITIONED, chunk_size=8, timestep_embedding=True, flow_steps=10, regression_coef=0.0)
 DEFAULTS: dict[str, Step] = {
     "one agent, DT": Step("dt", 11, 3, 256, 1, {**AGENT, **UNCONDITIONED}),
     "one agent, DTFM": Step("dtfm", 11, 3, 256, 1, {**AGENT, **MEAN, **UNCONDITIONED}),
@@ -64,7 +64,7 @@ DEFAULTS: dict[str, Step] = {
 }
 SMALL = dict(
     embed_dim=128, n_layers=3, flow_hidden_dim=128, tokens_per_step=1, chunk_size=1, timestep_embedding=True,
-    calm_units=True, n_solver_steps=3, regression_coef=0.0,
+    observation_scaling="robust", flow_steps=3, regression_coef=0.0,
 )  # fmt: skip
 WIDE = dict(SMALL, flow_hidden_dim=512, dropout=0.1)
 PAPER = dict(WIDE, embed_dim=256, n_layers=10)
@@ -128,10 +128,10 @@ def make_model(name: str, precision: str = "float32") -> OfflineSequenceAlgorith
     dataset = TrajectoryBuffer.from_trajectories(episodes, spaces.Box(-1, 1, (step.action_dim,)))
     known = policy_of(step.algo).parameter_names()
     decided = {key: value for key, value in CONDITIONED.items() if key in known}
-    given = dict(batch_size=step.batch_size, context_length=step.context_length, return_weight=0.0, ema_decay=0.999)
+    given = dict(batch_size=step.batch_size, context_length=step.context_length, return_weighting=0.0, ema_decay=0.999)
     return ALGORITHMS[step.algo](
         "MultiInputPolicy", dataset=dataset, policy_kwargs={**decided, **step.policy_kwargs}, precision=precision,
-        return_steps=0 if decided else None, device="cpu", seed=0, **given,
+        expected_return_steps=0 if decided else None, device="cpu", seed=0, **given,
     )  # fmt: skip
 
 

@@ -129,8 +129,8 @@ def main() -> None:
         model = make_model(algo, *sizes, precision=(numbers[5:] or ["float32" if profiled else "auto"])[0])
         work = functools.partial(train, model, n)
     else:
-        solver, n_solver_steps, kv_cache, n_envs, first = numbers[5], *map(int, numbers[6:])
-        ways = dict(solver=solver, n_solver_steps=n_solver_steps, kv_cache=bool(kv_cache))
+        solver, flow_steps, kv_cache, n_envs, first = numbers[5], *map(int, numbers[6:])
+        ways = dict(flow_solver=solver, flow_steps=flow_steps, kv_cache=bool(kv_cache))
         model = make_model(algo, *sizes, **ways)
         work = functools.partial(act, model, n, n_envs, first)
     work_profile = operations if what == "train" else calls

@@ -22,7 +22,7 @@ TINY_POLICY = dict(
     return_scaling="max",
     clip_return_to_go=False,
     film_return_to_go=False,
-    calm_units=False,
+    observation_scaling="std",
     return_conditioning=True,
 )
 TINY_FLOW_POLICY = dict(
@@ -32,12 +32,12 @@ TINY_FLOW_POLICY = dict(
     flow_prediction="velocity",
     flow_tau_exponent=1.0,
     regression_coef=0.0,
-    n_solver_steps=4,
-    one_step=True,
+    flow_steps=4,
+    one_step_policy=True,
 )
 # Constant learning rate and the newest weights: what a few gradient steps change shows at once.
 PLAIN = dict(
-    learning_rate=1e-4, learning_rate_schedule="constant", warmup_steps=0, ema_decay=0.0, return_weight=0.0, return_steps=0
+    learning_rate=1e-4, learning_rate_schedule="constant", warmup_steps=0, ema_decay=0.0, return_weighting=0.0, expected_return_steps=0
 )
 EPISODE_LENGTH = 30
 

@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
-from sb3_dtfm.distributed import first_of_each_machine_first
+from sb3_dtfm.distributed import local_rank_zero_first
 from sb3_dtfm.networks import trunk
 from sb3_dtfm.networks.cpu import dropout
 from tests.conftest import PLAIN, TINY_FLOW_POLICY, TINY_POLICY
@@ -127,7 +127,7 @@ def wait_for_a_slow_download(folder: Path) -> float:
     """
     meet_again(folder / "impatient", timeout=timedelta(seconds=DOWNLOAD / 2))
     start = time.monotonic()
-    with first_of_each_machine_first():
+    with local_rank_zero_first():
         if dist.get_rank() == 0:
             time.sleep(DOWNLOAD)
     waited = time.monotonic() - start

@@ -10,7 +10,7 @@ from sb3_dtfm.cli.main import main
 DATASET_ID = "tests/halfcheetah/random-v0"
 TINY = {
     "dt": "policy_kwargs:dict(embed_dim=16,n_layers=1,n_heads=1)",
-    "dtfm": "policy_kwargs:dict(embed_dim=16,n_layers=1,n_heads=1,flow_hidden_dim=16,flow_n_layers=1,n_solver_steps=2)",
+    "dtfm": "policy_kwargs:dict(embed_dim=16,n_layers=1,n_heads=1,flow_hidden_dim=16,flow_n_layers=1,flow_steps=2)",
 }
 
 

@@ -43,7 +43,7 @@ from sb3_dtfm.data import (
 )
 from sb3_dtfm.data.decisions import Decision, decide
 from sb3_dtfm.data.inspection import return_reference, suggested_target_return
-from sb3_dtfm.distributed import check_batch_size, first_of_each_machine_first, is_first_process
+from sb3_dtfm.distributed import check_batch_size, local_rank_zero_first, is_first_process
 from sb3_dtfm.envs import ReturnToGoWrapper, check_vec_env, known_task, return_to_go_space, share_target_return
 from sb3_dtfm.files import ModelFile, file_name, holds_pickles, read_model, write_model, write_onnx
 from sb3_dtfm.optimization import LEARNING_RATE_SCHEDULES, PRECISIONS, RunningMeans
@@ -60,8 +60,8 @@ ACCEPTED: dict[str, Rule] = {
     "context_length": Number(low=1, high=100_000, whole=True),
     "dataset_fraction": Number(low=0, high=1, above_low=True),
     "dataset_seed": Number(low=0, whole=True),
-    "return_weight": NOT_NEGATIVE._replace(optional=True),
-    "return_steps": Number(low=0, whole=True, optional=True),
+    "return_weighting": NOT_NEGATIVE._replace(optional=True),
+    "expected_return_steps": Number(low=0, whole=True, optional=True),
     "max_grad_norm": NOT_NEGATIVE._replace(optional=True),
     "warmup_steps": Number(low=0, whole=True),
     "learning_rate_schedule": Choice(LEARNING_RATE_SCHEDULES),
@@ -72,7 +72,7 @@ ACCEPTED: dict[str, Rule] = {
     "target_return": Number(optional=True),
 }
 # Arguments of the algorithm that the data decide where they are None; the policy's are among `policy_kwargs`.
-DECIDED = {"batch_size", "return_weight", "return_steps"}
+DECIDED = {"batch_size", "return_weighting", "expected_return_steps"}
 
 
 class OfflineAlgorithm(BaseAlgorithm, ABC):
@@ -92,10 +92,10 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
     :param context_length: K, steps the policy sees
     :param dataset_fraction: share of the episodes to learn from, randomly drawn
     :param dataset_seed: seed of that draw alone, so that different runs learn from the same episodes
-    :param return_weight: w: of mixed data, a step of the best episode is learned from 1 + w times as often as one of the
+    :param return_weighting: w: of mixed data, a step of the best episode is learned from 1 + w times as often as one of the
         worst, and others by their returns in between (Yue et al., 2022); 0 learns from all alike. By default 5 where
         returns tell how episodes act, and 0 elsewhere
-    :param return_steps: n: a step's return-to-go is the rewards of n steps and what may be expected after such an
+    :param expected_return_steps: n: a step's return-to-go is the rewards of n steps and what may be expected after such an
         observation, so that asking for the best does not ask for luck (Paster et al., 2022); 0 takes what was recorded. By
         default 50 where returns tell how episodes act and no number makes up half of the rewards, and 0 elsewhere
     :param dataset_kwargs: further arguments of :func:`~sb3_dtfm.data.load_dataset`: `{"cache_dir": folder}` for datasets
@@ -112,7 +112,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
     :param compile: compile the loss with `torch.compile`; None does so on a GPU, where one process starts its kernels as a
         CUDA graph. It takes a minute, and a C++ compiler
     :param policy_kwargs: arguments of the policy, for example `embed_dim`, `n_layers`, `n_heads`, `dropout`, `kv_cache`. The
-        data decide `dropout`, `chunk_size`, `n_solver_steps`, `regression_coef`, `timestep_embedding`, `calm_units`,
+        data decide `dropout`, `chunk_size`, `flow_steps`, `regression_coef`, `timestep_embedding`, `observation_scaling`,
         `return_conditioning` and `return_range` where they are not given, see :mod:`sb3_dtfm.data.decisions`
     :param stats_window_size: as in SB3; offline learning collects no episodes
     :param tensorboard_log: folder of the TensorBoard log, None for no log
@@ -141,8 +141,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         context_length: int = 1,
         dataset_fraction: float = 1.0,
         dataset_seed: int = 0,
-        return_weight: float | None = None,
-        return_steps: int | None = None,
+        return_weighting: float | None = None,
+        expected_return_steps: int | None = None,
         dataset_kwargs: dict[str, Any] | None = None,
         max_grad_norm: float | None = None,
         warmup_steps: int = 100,
@@ -181,8 +181,8 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         self.context_length = context_length
         self.dataset_fraction = dataset_fraction
         self.dataset_seed = dataset_seed
-        self.return_weight: float = return_weight  # type: ignore[assignment]  # as batch_size
-        self.return_steps: int = return_steps  # type: ignore[assignment]  # as batch_size
+        self.return_weighting: float = return_weighting  # type: ignore[assignment]  # as batch_size
+        self.expected_return_steps: int = expected_return_steps  # type: ignore[assignment]  # as batch_size
         self.dataset_kwargs = dataset_kwargs
         self.max_grad_norm = max_grad_norm
         self.warmup_steps = warmup_steps
@@ -222,12 +222,12 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         given = self.policy_kwargs or {}
         names = self._policy_class.parameter_names() - set(given)
         names |= {name for name in DECIDED if getattr(self, name) is None}
-        if given.get("n_solver_steps") == 0:  # the mean action, which a regression learns
+        if given.get("flow_steps") == 0:  # the mean action, which a regression learns
             names.discard("regression_coef")
         if given.get("return_conditioning") is False:
-            names.discard("return_steps")
+            names.discard("expected_return_steps")
         if given.get("regression_coef") == 0 or given.get("critic_steps"):  # no mean action; a choice among draws
-            names.discard("n_solver_steps")
+            names.discard("flow_steps")
         self.decisions = [each for each in decide(buffer) if each.name in names]
         values = {each.name: each.value for each in self.decisions}
         for name in DECIDED & set(values):
@@ -279,7 +279,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         if self.env is not None and (task := known_task(self.env)) is not None:
             self.time_limit = task.max_episode_steps
         known = {"action_space": getattr(self, "action_space", None), "max_episode_steps": self.time_limit}
-        with first_of_each_machine_first():
+        with local_rank_zero_first():
             buffer = load_dataset(self.dataset, **{**known, **(self.dataset_kwargs or {})})
         observation_space = return_to_go_space(buffer.observation_space)
         if getattr(self, "observation_space", None) is None:
@@ -299,10 +299,10 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
 
         :return: them, with the returns-to-go that the model is conditioned on
         """
-        if self.return_steps:
+        if self.expected_return_steps:
             if self.verbose >= 1 and is_first_process():
-                print(f"Learning which returns may be expected (return_steps={self.return_steps})", flush=True)
-            buffer = buffer.to("cpu").with_expected_returns(self.return_steps, self.dataset_seed)
+                print(f"Learning which returns may be expected (expected_return_steps={self.expected_return_steps})", flush=True)
+            buffer = buffer.to("cpu").with_expected_returns(self.expected_return_steps, self.dataset_seed)
         self.buffer = buffer.to(self.device)
         return self.buffer
 

@@ -51,14 +51,14 @@ POSITIVE_BUFFERS = {
     "normalization.return_scale",
     "normalization.return_std",
     "critic.reward_scale",
-    "critic.spread",
+    "critic.advantage_std",
 }
 # The optimiser's state of a weight: its own shape, or a number.
 MOMENTS = {"step": False, "exp_avg": True, "exp_avg_sq": True}
 
 
 @contextlib.contextmanager
-def naming_the_file(source: str) -> Iterator[None]:
+def wrap_file_errors(source: str) -> Iterator[None]:
     """
     Have whatever does not fit be a fault of the file.
 
@@ -101,17 +101,17 @@ def from_file(
             f"cannot be changed: got {changed['policy_kwargs']}."
         )
     model = algorithm(attributes["policy_class"], device=device, _init_setup_model=False)
-    if attributes.get("steering") is not None and not hasattr(model, "steering"):
+    if attributes.get("online_actor") is not None and not hasattr(model, "online_actor"):
         raise ModelFileError(
-            f"{source} is a DTFM with its steering: sb3_dtfm.finetuning.SteeredDTFM loads it. To go on learning, `sb3-dtfm "
+            f"{source} is a fine-tuned DTFM: sb3_dtfm.finetuning.FinetunedDTFM loads it. To go on learning, `sb3-dtfm "
             "finetune -i` takes the agent.zip beside it, and --model the DTFM that it began with."
         )
     vars(model).update(attributes)
-    with naming_the_file(source):
+    with wrap_file_errors(source):
         check_sizes(model, tensors[POLICY], source)
     vars(model).update(changed)
     model._setup_model()
-    with naming_the_file(source):
+    with wrap_file_errors(source):
         model.set_parameters(parameters(model.policy, tensors, source), device=device)
     return model
 
@@ -205,14 +205,14 @@ def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
     accepted = known and all(rule.accepts(value) for rule, value in zip(RETURN_REFERENCE, returns, strict=True))
     if returns is not None and not accepted:
         raise ModelFileError(f"{source}: return_reference is {returns}, expected {', '.join(ReturnReference._fields)}.")
-    with naming_the_file(source):
+    with wrap_file_errors(source):
         check_arguments({**dict.fromkeys(COUNTERS, 1), **attributes}, COUNTERS)  # one may have been left out
     observation, action = attributes["observation_space"], attributes["action_space"]
     parts = observation.spaces if isinstance(observation, spaces.Dict) else {}
     is_vector = {name: isinstance(part, spaces.Box) and len(part.shape) == 1 for name, part in parts.items()}
     if is_vector != dict.fromkeys((OBSERVATION, RETURN_TO_GO, TIMESTEP), True):
         raise ModelFileError(f"{source}: observation_space is {observation}, not what a ReturnToGoWrapper observes.")
-    with naming_the_file(source):
+    with wrap_file_errors(source):
         check_action_space(action, "action_space")
 
 

@@ -31,7 +31,7 @@ from sb3_dtfm.optimization import (
     learning_rate_factor,
     seed_default_generator,
     step_seed,
-    threads_that_pay,
+    limit_threads,
 )
 from sb3_dtfm.windows import Transitions, Windows
 
@@ -134,7 +134,7 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         parallel = DataParallel(self.policy, self._loss_function(), self.batch_size)
-        self._training_seed = parallel.from_first(self._choose_training_seed())
+        self._training_seed = parallel.broadcast(self._choose_training_seed())
         if self.verbose >= 1 and is_first_process():
             n_steps = total_timesteps - self.num_timesteps
             epochs = n_steps * self.batch_size / len(buffer)
@@ -144,15 +144,15 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
                 print(sentence, flush=True)
         batches = self._batches(buffer, self.batch_size)
         callback.on_training_start(locals(), globals())
-        parallel.from_first(True)  # which may evaluate for longer than a gradient step's messages wait
+        parallel.broadcast(True)  # which may evaluate for longer than a gradient step's messages wait
         while self.num_timesteps < total_timesteps:
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
-            self._train_step(batches, parallel)
+            self.train(batches, parallel)
             self.num_timesteps += 1
             if log_interval and (self.num_timesteps % log_interval == 0 or self.num_timesteps == total_timesteps):
                 self.dump_logs()
             callback.update_locals(locals())
-            if not parallel.from_first(callback.on_step()):
+            if not parallel.broadcast(callback.on_step()):
                 break
         self._check_finite(self._means.sums(), self._means.n_values)
         callback.on_training_end()
@@ -168,24 +168,24 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
             self.context_length,
             th.Generator(self.device),
             n_ahead=self.policy.chunk_size - 1,
-            return_weight=self.return_weight,
+            return_weighting=self.return_weighting,
             seeds=seeds,
         )
 
-    def _train_step(self, batches: Iterator[Windows], parallel: DataParallel) -> None:
+    def train(self, batches: Iterator[Windows], parallel: DataParallel) -> None:
         """The next gradient step, which the number of those before it decides, and how long it took."""
         assert self._training_seed is not None
         start = time.perf_counter()
         generator = th.Generator(self.device).manual_seed(step_seed(self._training_seed, self._n_updates, NOISE))
         seed_default_generator(self.device, step_seed(self._training_seed, self._n_updates, DROPOUT, parallel.rank))
-        with self._memory_errors_named(), threads_that_pay(self._n_products()):
+        with self._explain_out_of_memory(), limit_threads(self._n_macs()):
             self._gradient_step(next(batches), generator, parallel)
         self._training_seconds += time.perf_counter() - start
         self._timed_steps += 1
 
-    def _n_products(self) -> int:
+    def _n_macs(self) -> int:
         """Multiplications of a gradient step, forward and twice as many backward, without attention's."""
-        return 3 * self.batch_size * self.context_length * self.policy.network.n_products
+        return 3 * self.batch_size * self.context_length * self.policy.network.n_macs
 
     def _loss_function(self) -> LossFunction:
         """The policy's loss in the precision asked for, compiled where that pays."""
@@ -209,7 +209,7 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
             )
         else:
             n_rows = self.batch_size * self.context_length * self.policy.network.trunk.tokens_per_step
-            with threads_that_pay(self._n_products()):
+            with limit_threads(self._n_macs()):
                 precision, reason = choose_precision(self.policy.network, n_rows, self.device)
         if self.verbose >= 1 and is_first_process():
             print(reason, flush=True)
@@ -254,7 +254,7 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
     def _sample_transitions(self, batch_size: int, generator: th.Generator) -> Transitions:
         """What the critic learns from."""
         assert self.buffer is not None
-        return self.buffer.sample_transitions(batch_size, self.policy.n_valued, self.policy.gamma, generator)
+        return self.buffer.sample_transitions(batch_size, self.policy.critic_horizon, self.policy.gamma, generator)
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         factor = learning_rate_factor(self.learning_rate_schedule, *self._schedule_position(), self.warmup_steps)
@@ -319,7 +319,7 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         return f"at gradient step {self._n_updates} of this model, whose batch is from episodes {shown}{more} of its buffer"
 
     @contextlib.contextmanager
-    def _memory_errors_named(self) -> Iterator[None]:
+    def _explain_out_of_memory(self) -> Iterator[None]:
         """
         :raises MemoryError: in place of any error of memory, with the settings that decide how much is needed
         """
@@ -340,8 +340,8 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         for name, mean in means.items():
             self.logger.record(f"train/{name}", mean)
         self.logger.record("train/action_mse", self._on_training_windows(self.policy.action_mse))
-        if self.policy.n_candidates > 1:
-            self.logger.record("train/guided_share", self._on_training_windows(self.policy.guided_share))
+        if self.policy.n_action_samples > 1:
+            self.logger.record("train/best_of_n_share", self._on_training_windows(self.policy.best_of_n_share))
         self.logger.record("train/learning_rate", self._current_learning_rate)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("time/steps_per_second", self._timed_steps / self._training_seconds)

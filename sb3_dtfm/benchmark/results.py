@@ -91,8 +91,8 @@ COLUMNS = {
     "wall_s": Column("wall_s", _number),
     "steps_per_s": Column("steps_per_s", _number),
     "action_ms": Column("action_ms", _number, True),
-    "solver": Column("solver", str, True),
-    "solver_steps": Column("n_solver_steps", int, True),
+    "flow_solver": Column("flow_solver", str, True),
+    "flow_steps": Column("flow_steps", int, True),
     "commit": Column("commit", str, True),
     "env_id": Column("env_id", str, True),
     "steps_to_success": Column("steps_to_success", _numbers),
@@ -102,7 +102,7 @@ COLUMNS = {
     "versions": Column("versions", _versions, "run"),
 }
 # What is said of a run once, with its final evaluation.
-OF_A_RUN = ("action_ms", "solver", "n_solver_steps", "commit", "env_id", "data", "settings", "hardware", "versions")
+OF_A_RUN = ("action_ms", "flow_solver", "flow_steps", "commit", "env_id", "data", "settings", "hardware", "versions")
 
 
 def summarize(row: Row) -> Result:

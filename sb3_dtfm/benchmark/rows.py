@@ -13,8 +13,8 @@ KEYS: dict[str, tuple[type, ...]] = {
     "final": (bool,),
     **dict.fromkeys(("returns", "lengths"), (list,)),
     "successes": (list, type(None)),
-    "n_solver_steps": (int, type(None)),
-    **dict.fromkeys(("solver", "commit"), (str, type(None))),
+    "flow_steps": (int, type(None)),
+    **dict.fromkeys(("flow_solver", "commit"), (str, type(None))),
     **dict.fromkeys(("versions", "hardware", "settings", "data"), (dict,)),
 }
 # What earlier rows do not tell, and the Gymnasium id where the task has another name.

@@ -7,7 +7,7 @@ from pathlib import Path
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.cli.literals import key_value
 from sb3_dtfm.files import read_configuration
-from sb3_dtfm.finetuning import SteeredDTFM
+from sb3_dtfm.finetuning import FinetunedDTFM
 
 
 def main(argv: Sequence[str]) -> None:
@@ -30,7 +30,7 @@ def main(argv: Sequence[str]) -> None:
         default=[],
         type=key_value,
         metavar="KEY:VALUE",
-        help="for example n_solver_steps:10 or kv_cache:True; as saved by default",
+        help="for example flow_steps:10 or kv_cache:True; as saved by default",
     )
     options = parser.parse_args(argv)
     path = find_model(options.model)
@@ -38,8 +38,8 @@ def main(argv: Sequence[str]) -> None:
     algorithm = str(configuration.get("algorithm"))
     if algorithm.lower() not in ALGORITHMS:
         raise ValueError(f"{path} was saved by {algorithm}; {' and '.join(ALGORITHMS)} can be exported.")
-    steered = dict(configuration.get("attributes") or {}).get("steering") is not None
-    model = (SteeredDTFM if steered else ALGORITHMS[algorithm.lower()]).load(path, device="cpu")
+    finetuned = dict(configuration.get("attributes") or {}).get("online_actor") is not None
+    model = (FinetunedDTFM if finetuned else ALGORITHMS[algorithm.lower()]).load(path, device="cpu")
     model.policy.set_acting(**dict(options.acting))
     model.export(options.output, options.env, options.target_return)
     print(f"Policy: {options.output}")

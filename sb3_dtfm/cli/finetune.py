@@ -13,7 +13,7 @@ EXAMPLES = """\
   sb3-dtfm finetune --model logs/dtfm/robosuite-Can-v0_1 --env robosuite/Can-v0 --algo dtfm -n 100000
   sb3-dtfm finetune --model logs/dtfm/robosuite-Lift-v0_1 --env robosuite/Lift-v0 --algo sac -n 20000
   sb3-dtfm finetune --model logs/dtfm/HalfCheetah-v5_1 --env HalfCheetah-v5 --algo ppo -n 1000000
-  sb3-dtfm enjoy --algo steered --env robosuite/Lift-v0 --load-best
+  sb3-dtfm enjoy --algo finetuned --env robosuite/Lift-v0 --load-best
 """
 # Of a run, beside those at its beginning and end.
 EVALUATIONS_OF_A_RUN = 10
@@ -55,7 +55,7 @@ def _parser() -> argparse.ArgumentParser:
         add_help=False,
         usage="sb3-dtfm finetune --model MODEL --env ENV [options] [RL-Zoo options]",
         description="Go on learning online: a DTFM from its own episodes (--algo dtfm), or an SB3 algorithm "
-        "that chooses the noise of a frozen one, or corrects its actions.",
+        "that chooses the noise of a frozen one, or residual its actions.",
         epilog=f"examples:\n{EXAMPLES}\nRL-Zoo's own options follow.\n",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -107,7 +107,7 @@ def _parser() -> argparse.ArgumentParser:
     argument("--episodes", type=_at_least(1), default=10, metavar="N", help="for each return; 10 by default")
     argument("--n-envs", type=_at_least(1), default=10, metavar="N", help="environments side by side; 10 by default")
     argument(
-        "--acting", nargs="+", default=[], metavar="KEY:VALUE", help="for example n_solver_steps:10; as saved by default"
+        "--acting", nargs="+", default=[], metavar="KEY:VALUE", help="for example flow_steps:10; as saved by default"
     )
     argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="to import first: they register tasks")
     argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="as in train")

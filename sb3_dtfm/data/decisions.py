@@ -96,7 +96,7 @@ def _by_return(errors: PredictionErrors | None) -> list[Decision]:
     reason = f"An episode's return {verb} how it acts (knowing it predicts held-out actions {t:.1f} standard errors better)."
     return [
         Decision("return_conditioning", tells, reason),
-        Decision("return_weight", RETURN_WEIGHT if tells else 0.0, reason),
+        Decision("return_weighting", RETURN_WEIGHT if tells else 0.0, reason),
     ]
 
 
@@ -115,7 +115,7 @@ def _by_reward(buffer: TrajectoryBuffer) -> list[Decision]:
     varies = 2 * n_equal < len(rewards)
     reason = f"{n_equal / len(rewards):.0%} of the rewards are one number (half or more if they tell of success alone)."
     return [
-        Decision("return_steps", RETURN_STEPS if varies else 0, reason),
+        Decision("expected_return_steps", RETURN_STEPS if varies else 0, reason),
         Decision("return_range", varies, reason),
     ]
 
@@ -125,7 +125,7 @@ def _kind_of_actor(errors: PredictionErrors | None, correlation: float) -> list[
     ratio = None if errors is None else errors.plan_ratio()
     plans = ratio is not None and ratio > 1.0
     # The trunk learns by the loss of what acts: the flow's, or the regression's.
-    flow = {"n_solver_steps": FLOW_STEPS if plans else 0, "regression_coef": 0.0 if plans else 1.0}
+    flow = {"flow_steps": FLOW_STEPS if plans else 0, "regression_coef": 0.0 if plans else 1.0}
     # Scripts depend on the time step: it raised success on Lift from 34 to 46 %, ten demonstrations and batches of 256.
     settings = {"chunk_size": CHUNK_SIZE if plans else 1, **flow, "timestep_embedding": plans}
     better, worse = ("The previous action", "the observation") if plans else ("The observation", "the previous action")
@@ -135,5 +135,5 @@ def _kind_of_actor(errors: PredictionErrors | None, correlation: float) -> list[
     # Ten Lifts by a script are solved in 76 % without robust units and in 43 % with them; people's door 6 and 49 %.
     robust = not plans or correlation < NOISY
     noise = f"Successive changes of an action correlate by {correlation:.2f} (noise does by less than {NOISY})."
-    units = Decision("calm_units", robust, noise if plans else reason)
+    units = Decision("observation_scaling", "robust" if robust else "std", noise if plans else reason)
     return [*(Decision(name, value, reason) for name, value in settings.items()), units]

@@ -94,7 +94,7 @@ class FlatSteps:
         context_length: int,
         generator: th.Generator,
         n_ahead: int = 0,
-        return_weight: float = 0.0,
+        return_weighting: float = 0.0,
         seeds: Iterable[int] | None = None,
     ) -> Iterator[Windows]:
         """
@@ -106,13 +106,13 @@ class FlatSteps:
         :param context_length: K
         :param generator: source of randomness, of nothing else: it is a batch ahead
         :param n_ahead: see :meth:`windows`
-        :param return_weight: w: a step of an episode of return R is drawn 1 + w (R - Rmin) / (Rmax - Rmin) times as often as
+        :param return_weighting: w: a step of an episode of return R is drawn 1 + w (R - Rmin) / (Rmax - Rmin) times as often as
             one of the worst episode (Yue et al., 2022)
         :param seeds: what `generator` is seeded with before it draws, one number a batch: where each is its own, a run that
             goes on draws what it would have drawn. Without them the generator draws on
         """
-        differ = return_weight > 0 or (self.weights != self.weights[0]).any()
-        weights = self._episode_weights(return_weight).to(generator.device) if differ else None
+        differ = return_weighting > 0 or (self.weights != self.weights[0]).any()
+        weights = self._episode_weights(return_weighting).to(generator.device) if differ else None
 
         def ends() -> Iterator[th.Tensor]:
             for seed in itertools.repeat(None) if seeds is None else seeds:
@@ -180,10 +180,10 @@ class FlatSteps:
         )
         return Transitions(*(tensor.to(self.device) for tensor in batch))
 
-    def _episode_weights(self, return_weight: float) -> th.Tensor:
+    def _episode_weights(self, return_weighting: float) -> th.Tensor:
         """(E,) float32, with what probability an episode is drawn, up to a factor: by its length, its weight, its return."""
         returns = self.episodes.returns - self.episodes.returns.min()
-        by_return = 1.0 + return_weight * returns / (returns.max() or 1.0)
+        by_return = 1.0 + return_weighting * returns / (returns.max() or 1.0)
         return th.from_numpy(self.weights * self.episodes.lengths * by_return).float()
 
     def _draw(self, batch_size: int, generator: th.Generator | None, episode_weights: th.Tensor | None = None) -> th.Tensor:

@@ -12,22 +12,22 @@ BLOCK_BYTES = 2**18
 # A variance below this share of the mean square is computed again, without the mean.
 CANCELLATION = 1e-5
 # The calmest share of the episodes decides the unit of a dimension, which is at least this share of its standard deviation.
-CALM_EPISODES = 0.25
-SMALLEST_UNIT = 0.1
+ROBUST_QUANTILE = 0.25
+SMALLEST_ROBUST_STD = 0.1
 
 
 class Statistics(NamedTuple):
     """
     What inputs are normalised by.
 
-    Shapes: observation_mean (O,) and observation_std (O,) over all steps, float64; observation_unit (O,), the same as the
+    Shapes: observation_mean (O,) and observation_std (O,) over all steps, float64; observation_robust_std (O,), the same as the
     standard deviation but where some episodes spread much wider than others, see :meth:`EpisodeTable.statistics`;
     return_scale, the largest absolute return-to-go in environment reward units.
     """
 
     observation_mean: np.ndarray
     observation_std: np.ndarray
-    observation_unit: np.ndarray
+    observation_robust_std: np.ndarray
     return_scale: float
 
     def normalize(self, observations: th.Tensor) -> th.Tensor:
@@ -81,7 +81,7 @@ class EpisodeTable(NamedTuple):
         std = np.sqrt(squares / n_steps)
         offsets = self.observation_means - np.median(self.observation_means, axis=0)
         spreads = np.sqrt(self.observation_squares / self.lengths[:, None] + np.square(offsets))
-        unit = np.clip(np.quantile(spreads, CALM_EPISODES, axis=0), SMALLEST_UNIT * std, std)
+        unit = np.clip(np.quantile(spreads, ROBUST_QUANTILE, axis=0), SMALLEST_ROBUST_STD * std, std)
         return Statistics(mean, std, unit, float(self.return_scales.max()))
 
 

@@ -31,7 +31,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
     :param model: a DTFM, or the path to a saved one
     :param bound: how far the choice may go
     :param hidden_state: show the trunk's hidden state as well
-    :raises ValueError: a model that is steered already, one or environments that do not fit, or an argument out of range
+    :raises ValueError: a model that has an online actor already, one or environments that do not fit, or an argument out of range
     """
 
     def __init__(
@@ -44,8 +44,8 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
         check_arguments({"bound": bound}, {"bound": POSITIVE})
         if isinstance(model, str | PathLike):
             model = DTFM.load(model, device="cpu")  # type: ignore[arg-type]
-        if model.policy.steering is not None:
-            raise ValueError(f"This {type(model).__name__} is steered already; take the DTFM that it was made of.")
+        if model.policy.online_actor is not None:
+            raise ValueError(f"This {type(model).__name__} has an online actor already; take the DTFM that it was made of.")
         action_space = self._action_space(model.policy, float(bound))
         check_vec_env(venv)
         model._check_spaces(venv.observation_space, venv.action_space, "The environment has", "the model's are")  # type: ignore[arg-type]
@@ -85,7 +85,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
     def _show(self, context: Context, hidden: th.Tensor) -> np.ndarray:
         """:return: (B, F), what is observed of rows that have not acted"""
         with th.inference_mode():
-            shown = self.policy.steering_observation(context.windows, hidden if self.hidden_state else None)
+            shown = self.policy.actor_observation(context.windows, hidden if self.hidden_state else None)
         return shown.cpu().numpy()
 
     @property
@@ -95,7 +95,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
 
     def reset(self) -> VecEnvObs:
         observations = self.venv.reset()
-        self._known = self.policy.look(observations, episode_start=np.ones(self.num_envs, bool))  # type: ignore[arg-type]
+        self._known = self.policy.encode(observations, episode_start=np.ones(self.num_envs, bool))  # type: ignore[arg-type]
         return self._show(*self._known)
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -115,9 +115,9 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
         for row in np.flatnonzero(dones):
             context = self._pass(Context(*(each[[row]] for each in self._acted)), [between[row]], n_between[row])
             last = {key: value[None] for key, value in infos[row]["terminal_observation"].items()}
-            infos[row]["terminal_observation"] = self._show(*self.policy.look(last, context))[0]
+            infos[row]["terminal_observation"] = self._show(*self.policy.encode(last, context))[0]
         context = self._pass(self._acted, between, self.policy.n_action_steps - 1)
-        self._known = self.policy.look(observations, context, dones)  # type: ignore[arg-type]
+        self._known = self.policy.encode(observations, context, dones)  # type: ignore[arg-type]
         return self._show(*self._known), rewards, dones, infos
 
     def _pass(self, context: Context, between: list[dict[str, np.ndarray]], n_steps: int) -> Context:

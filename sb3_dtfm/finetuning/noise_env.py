@@ -12,10 +12,10 @@ from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
 from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.windows import Context
 
-# Of the noise, as in diffusion steering (Wagenmaker et al., 2025).
+# Largest noise in a dimension, as in DSRL (Wagenmaker et al., 2025).
 NOISE_BOUND = 1.5
 # Of a model that acts by one, which leaves nothing to choose.
-STEERED_SOLVER_STEPS = 3
+NOISE_SPACE_FLOW_STEPS = 3
 
 
 class NoiseSpace(spaces.Box):
@@ -65,13 +65,13 @@ class NoiseActionVecEnv(FrozenPolicyVecEnv):
 
     @staticmethod
     def _action_space(policy: SequencePolicy, bound: float) -> spaces.Box:
-        noise_dim = policy.check_steerable()
+        noise_dim = policy.check_noise_actions()
         if not policy.network.head.noise_decides:
             raise ValueError(
-                "n_solver_steps=1: one step of Euler ends at the mean action, from any noise; "
-                f"model.policy.set_acting(n_solver_steps={STEERED_SOLVER_STEPS}) leaves a choice."
+                "flow_steps=1: one step of Euler ends at the mean action, from any noise; "
+                f"model.policy.set_acting(flow_steps={NOISE_SPACE_FLOW_STEPS}) leaves a choice."
             )
         return NoiseSpace(noise_dim, bound)
 
     def _act(self, context: Context, hidden: th.Tensor, actions: np.ndarray) -> tuple[np.ndarray, Context]:
-        return self.policy.act_from_noise(context, hidden, actions)
+        return self.policy.decode(context, hidden, actions)

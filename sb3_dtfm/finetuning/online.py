@@ -52,7 +52,7 @@ class OnlineDTFM(DTFM):
     It acts from fresh noise, so that no two attempts are alike; what worked is imitated, and works more often from then on.
     Where the environment tells of no success, an episode is imitated that returned at least as much as the average of
     dataset and own episodes so far. With a critic (`critic_steps` among the `policy_kwargs`) all episodes teach the critic,
-    failures too, and the critic chooses among `n_candidates` draws.
+    failures too, and the critic chooses among `n_action_samples` draws.
 
     `learn(total_timesteps)` counts the environments' steps, as online algorithms do. What it becomes is a DTFM, and saved as
     one: `OnlineDTFM.load("can.zip", env, dataset="can.hdf5")` goes on from a DTFM, and `DTFM.load` reads what it saves.
@@ -242,7 +242,7 @@ class OnlineDTFM(DTFM):
         batches = self._imitated()
         self._n_left = n_steps
         while self._n_left:
-            self._train_step(batches, parallel)
+            self.train(batches, parallel)
             self._n_left -= 1
         if self._state is not None:
             context = Context(*self._state)
@@ -256,8 +256,8 @@ class OnlineDTFM(DTFM):
         successes, returns = self.replay_buffer.successes, self.replay_buffer.episode_returns
         worthy = np.flatnonzero(np.where(np.isnan(successes), returns >= average, successes == 1.0))
         imitated = self.replay_buffer.select(worthy) if len(worthy) else None
-        if imitated is not None and self.return_steps:
-            imitated = imitated.to("cpu").with_expected_returns(self.return_steps, self.dataset_seed).to(self.device)
+        if imitated is not None and self.expected_return_steps:
+            imitated = imitated.to("cpu").with_expected_returns(self.expected_return_steps, self.dataset_seed).to(self.device)
         n_own = self._n_own(imitated, self.batch_size) if imitated is not None else 0
         streams = [self._batches(self.buffer, self.batch_size - n_own)] if n_own < self.batch_size else []
         if imitated is not None:
@@ -275,7 +275,7 @@ class OnlineDTFM(DTFM):
         if self.replay_buffer is None:
             return super()._sample_transitions(batch_size, generator)
         n_own = self._n_own(self.replay_buffer, batch_size)
-        own = self.replay_buffer.sample_transitions(n_own, self.policy.n_valued, self.policy.gamma, generator)
+        own = self.replay_buffer.sample_transitions(n_own, self.policy.critic_horizon, self.policy.gamma, generator)
         if n_own == batch_size:
             return own
         others = super()._sample_transitions(batch_size - n_own, generator)

@@ -28,9 +28,9 @@ OPTIONS: dict[str, Rule] = {
     "flow_prediction": Choice(("velocity", "action")),
     "flow_tau_exponent": POSITIVE,
     "regression_coef": NOT_NEGATIVE,
-    "one_step": BOOLEAN,
+    "one_step_policy": BOOLEAN,
 }
-ACTING: dict[str, Rule] = {"solver": Choice((*SOLVERS, ONE_STEP)), "n_solver_steps": Number(low=0, high=10_000, whole=True)}
+ACTING: dict[str, Rule] = {"flow_solver": Choice((*SOLVERS, ONE_STEP)), "flow_steps": Number(low=0, high=10_000, whole=True)}
 
 
 def interpolate(noise: th.Tensor, action: th.Tensor, tau: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -61,10 +61,10 @@ class FlowHead(ActionHead):
     regression, and what noise and time have to add to it is learned.
 
     With `regression_coef` above 0, trunk and W h + b learn by Decision Transformer's loss, and the FiLM network by flow
-    matching from a hidden state that it gives no gradient. `n_solver_steps=0` then acts with tanh(W h + b), the mean action.
+    matching from a hidden state that it gives no gradient. `flow_steps=0` then acts with tanh(W h + b), the mean action.
     By the flow's loss alone the trunk learns the mean more slowly.
 
-    With `one_step` a second network learns where `n_solver_steps` of Euler end, 16 at most, so that an action can take one
+    With `one_step` a second network learns where `flow_steps` of Euler end, 16 at most, so that an action can take one
     evaluation instead of one per solver step. It learns from the field and gives nothing back: trunk and field are what they
     are without it. Where the field predicts actions, this network adds to the same W h + b, and starts at zero too; else it
     adds to the noise.
@@ -76,15 +76,15 @@ class FlowHead(ActionHead):
     :param flow_prediction: what the head learns of the path: its "velocity", or the "action" it leads to
     :param flow_tau_exponent: tau of the loss is u to this power for u uniform in [0, 1]: above 1 it is more often near the
         noise, where the action has to come from the hidden state
-    :param solver: how to act: an ODE solver, euler, midpoint, heun or rk4; or one_step, the network that learnt its end
-    :param n_solver_steps: steps of the ODE solver; 0 takes the mean action, which no noise changes
-    :param one_step: train that network
+    :param flow_solver: how to act: an ODE solver, euler, midpoint, heun or rk4; or one_step, the network that learnt its end
+    :param flow_steps: steps of the ODE solver; 0 takes the mean action, which no noise changes
+    :param one_step_policy: train that network
     :param regression_coef: weight of the regression of the action from the hidden state; 0 leaves it out
     :raises ValueError: an option out of range, by name
     """
 
     algorithm = "DTFM"
-    acting_choices = ("solver", "n_solver_steps")
+    acting_choices = ("flow_solver", "flow_steps")
 
     def __init__(
         self,
@@ -95,9 +95,9 @@ class FlowHead(ActionHead):
         flow_n_layers: int = 3,
         flow_prediction: str = "action",
         flow_tau_exponent: float = 2.0,
-        solver: str = "euler",
-        n_solver_steps: int = 10,
-        one_step: bool = False,
+        flow_solver: str = "euler",
+        flow_steps: int = 10,
+        one_step_policy: bool = False,
         regression_coef: float = 1.0,
     ) -> None:
         super().__init__(embed_dim, action_dim)
@@ -110,29 +110,29 @@ class FlowHead(ActionHead):
         self.predicts_action = flow_prediction == "action"
         regresses = self.predicts_action or regression_coef > 0
         self.regression = RegressionHead(embed_dim, action_dim) if regresses else None
-        self.one_step = FilmNetwork(*sizes) if one_step else None
+        self.one_step_policy = FilmNetwork(*sizes) if one_step_policy else None
         if self.predicts_action:
-            for network in (self.vector_field, self.one_step):
+            for network in (self.vector_field, self.one_step_policy):
                 if network is not None:
                     nn.init.zeros_(network.output.weight)
                     nn.init.zeros_(network.output.bias)
-        acting = self.check_acting(solver=solver, n_solver_steps=n_solver_steps)
-        self.solver: str = acting["solver"]
-        self.n_solver_steps: int = acting["n_solver_steps"]
-        self.n_distilled_steps = min(max(n_solver_steps, 1), MAX_DISTILLED_STEPS)  # however it acts later
+        acting = self.check_acting(flow_solver=solver, flow_steps=flow_steps)
+        self.flow_solver: str = acting["flow_solver"]
+        self.flow_steps: int = acting["flow_steps"]
+        self.n_distilled_steps = min(max(flow_steps, 1), MAX_DISTILLED_STEPS)  # however it acts later
 
     def check_acting(self, **choices: Any) -> dict[str, Any]:
         choices = check_arguments(choices, ACTING)
-        if choices["solver"] == ONE_STEP and self.one_step is None:
-            raise ValueError(f"solver={ONE_STEP!r} needs a model that was trained with policy_kwargs=dict(one_step=True).")
-        if choices["n_solver_steps"] == 0 and not self.regression_coef:
-            raise ValueError("n_solver_steps=0 needs a model that was trained with policy_kwargs=dict(regression_coef=1.0).")
+        if choices["flow_solver"] == ONE_STEP and self.one_step_policy is None:
+            raise ValueError(f"flow_solver={ONE_STEP!r} needs a model that was trained with policy_kwargs=dict(one_step_policy=True).")
+        if choices["flow_steps"] == 0 and not self.regression_coef:
+            raise ValueError("flow_steps=0 needs a model that was trained with policy_kwargs=dict(regression_coef=1.0).")
         return choices
 
     @property
     def noise_decides(self) -> bool:
         """Not without a solver's step, nor by one of Euler, which ends at the mean action from wherever it begins."""
-        return self.solver == ONE_STEP or self.n_solver_steps > (1 if self.solver == "euler" else 0)
+        return self.flow_solver == ONE_STEP or self.flow_steps > (1 if self.flow_solver == "euler" else 0)
 
     def draw_noise(self, actions: th.Tensor, generator: th.Generator) -> tuple[th.Tensor, ...]:
         batch_size, context_length = actions.shape[:2]
@@ -152,7 +152,7 @@ class FlowHead(ActionHead):
             assert self.regression is not None
             regression_loss, regression_parts = self.regression.loss(hidden, actions, mask)
             loss, parts = loss + self.regression_coef * regression_loss, {**parts, **regression_parts}
-        if self.one_step is not None:
+        if self.one_step_policy is not None:
             parts["one_step_loss"] = self.one_step_loss(hidden[:, -1], mask[:, -1], starts[:, -1])
             loss = loss + parts["one_step_loss"]
         return loss, parts
@@ -199,20 +199,20 @@ class FlowHead(ActionHead):
         return masked_mean((self.one_step_action(hidden, noise) - target).square(), mask)
 
     def forward(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
-        if self.solver == ONE_STEP:
+        if self.flow_solver == ONE_STEP:
             return self.one_step_action(hidden, noise)
-        if self.n_solver_steps == 0:
+        if self.flow_steps == 0:
             assert self.regression is not None
             return self.regression(hidden)
-        return self.solve(hidden, noise, self.solver, self.n_solver_steps)
+        return self.solve(hidden, noise, self.flow_solver, self.flow_steps)
 
     def one_step_action(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
         """From noise (..., A) to actions (..., A) in one step. No gradient flows into the field's W h + b."""
-        assert self.one_step is not None
-        change = self.one_step(noise, self.one_step.film_condition(hidden))
+        assert self.one_step_policy is not None
+        change = self.one_step_policy(noise, self.one_step_policy.film_condition(hidden))
         return (self._regressed(hidden).detach() + change).tanh() if self.predicts_action else noise + change
 
-    def solve(self, hidden: th.Tensor, noise: th.Tensor, solver: str, n_solver_steps: int) -> th.Tensor:
+    def solve(self, hidden: th.Tensor, noise: th.Tensor, flow_solver: str, flow_steps: int) -> th.Tensor:
         """
         Carry noise to actions along the vector field.
 
@@ -220,11 +220,11 @@ class FlowHead(ActionHead):
 
         :param hidden: (..., D)
         :param noise: (..., A), standard normal
-        :param solver: a key of `SOLVERS`
-        :param n_solver_steps: number of steps
+        :param flow_solver: a key of `SOLVERS`
+        :param flow_steps: number of steps
         :return: (..., A), in [-1, 1] as far as it was learnt; the policy clips
         """
-        times = solver_times(solver, n_solver_steps, hidden.device)
+        times = solver_times(flow_solver, flow_steps, hidden.device)
         condition, time_shares = self.vector_field.film_condition(hidden), self.vector_field.time_share(times)
         regressed = self._regressed(hidden) if self.predicts_action else None
         velocity = noise
@@ -240,7 +240,7 @@ class FlowHead(ActionHead):
             # Heun and RK4 look at tau = 1 too, where a predicted action gives 0 / 0: the slope before it stands in.
             return velocity
 
-        return integrate(field, noise, solver, n_solver_steps)
+        return integrate(field, noise, flow_solver, flow_steps)
 
     def paths(self, hidden: th.Tensor, noise: th.Tensor, n_points: int = 50) -> th.Tensor:
         """
@@ -257,11 +257,11 @@ class FlowHead(ActionHead):
         return th.stack([*points, end])
 
     def part_masks(self, mask: th.Tensor) -> dict[str, th.Tensor]:
-        return {"one_step_loss": mask[:, -1]} if self.one_step is not None else {}
+        return {"one_step_loss": mask[:, -1]} if self.one_step_policy is not None else {}
 
     def unclipped_parameters(self) -> list[nn.Parameter]:
         """The one-step network's: it must not change how the others are clipped."""
-        return [] if self.one_step is None else list(self.one_step.parameters())
+        return [] if self.one_step_policy is None else list(self.one_step_policy.parameters())
 
     @staticmethod
     def search_space(trial: Any) -> dict[str, Any]:
@@ -270,5 +270,5 @@ class FlowHead(ActionHead):
             "flow_n_layers": trial.suggest_int("flow_n_layers", 2, 4),
             "flow_prediction": trial.suggest_categorical("flow_prediction", ["velocity", "action"]),
             "flow_tau_exponent": trial.suggest_categorical("flow_tau_exponent", [1.0, 2.0]),
-            "n_solver_steps": trial.suggest_categorical("n_solver_steps", [0, 3, 10, 50]),
+            "flow_steps": trial.suggest_categorical("flow_steps", [0, 3, 10, 50]),
         }

@@ -16,7 +16,7 @@ NumPy's times are those of `dot` on two threads that nobody disturbs, see :class
 
 All weights of a small model stay in the cache, and there torch is the faster one up to `LARGE_WEIGHT`.
 
-Kept keys and values, copied at every step instead of appended to, make an action for 16 environments at the paper's size
+Keys and values, copied at every step instead of appended to, make an action for 16 environments at the paper's size
 take 21 % longer (19 MB). A dropout mask takes an eighth of torch's time.
 """
 
@@ -120,7 +120,7 @@ def _draws_masks_here(x: th.Tensor) -> bool:
     return x.device.type == "cpu" and not th.compiler.is_compiling()
 
 
-class Kept(np.ndarray):
+class KeyValueCache(np.ndarray):
     """
     Keys and values of earlier steps, (B, layers, 2, L, D), which never change, and the memory behind them.
 
@@ -131,20 +131,20 @@ class Kept(np.ndarray):
     behind: list[tuple[th.Tensor, int]]
 
 
-def hand_out(memory: th.Tensor, start: int, end: int) -> Kept:
+def make_cache(memory: th.Tensor, start: int, end: int) -> KeyValueCache:
     """
     :param memory: (B, layers, 2, M, D), on any device
     :param start: of what is kept, along the fourth axis
     :param end: of what is kept
     """
-    kept = memory[..., start:end, :].cpu().numpy().view(Kept)
+    kept = memory[..., start:end, :].cpu().numpy().view(KeyValueCache)
     kept.behind = [(memory, end)]
     return kept
 
 
-def take_up(kept: np.ndarray, n_tokens: int, device: th.device) -> tuple[th.Tensor, int]:
+def reserve_cache(kept: np.ndarray, n_tokens: int, device: th.device) -> tuple[th.Tensor, int]:
     """
-    :param kept: what :func:`hand_out` gave, a copy of it, or another array like it
+    :param kept: what :func:`make_cache` gave, a copy of it, or another array like it
     :param n_tokens: how many will be appended
     :param device: where they will
     :return: memory with room for them that is nobody else's, and where `kept` ends in it

@@ -38,7 +38,7 @@ SOLVERS: dict[str, SolverStep] = {
 }
 
 
-def integrate(field: Field, noise: th.Tensor, solver: str = "euler", n_solver_steps: int = 50) -> th.Tensor:
+def integrate(field: Field, noise: th.Tensor, flow_solver: str = "euler", flow_steps: int = 50) -> th.Tensor:
     """
     Follow dx/dtau = field(x, tau) from tau = 0 to tau = 1 in equal steps.
 
@@ -47,19 +47,19 @@ def integrate(field: Field, noise: th.Tensor, solver: str = "euler", n_solver_st
 
     :param field: velocity of (x, tau), shaped like x
     :param noise: (..., A), x at tau = 0
-    :param solver: a key of `SOLVERS`
-    :param n_solver_steps: number of steps, at least 1
+    :param flow_solver: a key of `SOLVERS`
+    :param flow_steps: number of steps, at least 1
     :return: x at tau = 1, (..., A)
     """
-    step_function = SOLVERS[solver]
-    step = 1.0 / n_solver_steps
+    step_function = SOLVERS[flow_solver]
+    step = 1.0 / flow_steps
     x = noise
-    for i in range(n_solver_steps):
+    for i in range(flow_steps):
         x = step_function(field, x, i * step, step)
     return x
 
 
-def solver_times(solver: str, n_solver_steps: int, device: th.device | None = None) -> th.Tensor:
+def solver_times(flow_solver: str, flow_steps: int, device: th.device | None = None) -> th.Tensor:
     """Equally spaced times from 0 to 1 among which a solver evaluates its field: whole steps, or half ones as well."""
-    intervals = n_solver_steps if solver == "euler" else 2 * n_solver_steps
+    intervals = flow_steps if flow_solver == "euler" else 2 * flow_steps
     return th.linspace(0.0, 1.0, intervals + 1, device=device)

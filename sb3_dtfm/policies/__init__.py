@@ -19,15 +19,15 @@ class DTFMPolicy(SequencePolicy):
 
     head_class = FlowHead
 
-    def set_solver(self, solver: str, n_solver_steps: int = 1) -> None:
+    def set_solver(self, flow_solver: str, flow_steps: int = 1) -> None:
         """
         Choose how to act; the trained weights do not depend on it.
 
-        :param solver: euler, midpoint, heun or rk4, or one_step: a single evaluation of the network that learnt their end
-        :param n_solver_steps: steps of the ODE solver
+        :param flow_solver: euler, midpoint, heun or rk4, or one_step: a single evaluation of the network that learnt their end
+        :param flow_steps: steps of the ODE solver
         :raises ValueError: unknown solver, fewer than one step, or one_step of a model that did not learn it
         """
-        self.set_acting(solver=solver, n_solver_steps=n_solver_steps)
+        self.set_acting(flow_solver=solver, flow_steps=flow_steps)
 
 
 __all__ = ["DTFMPolicy", "DTPolicy", "SequencePolicy"]

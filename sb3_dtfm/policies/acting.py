@@ -14,7 +14,7 @@ from sb3_dtfm.policies.critic import Critic
 from sb3_dtfm.policies.memory import RememberedContext
 from sb3_dtfm.policies.network import SequenceNetwork
 from sb3_dtfm.policies.normalization import Normalization
-from sb3_dtfm.policies.steering import Steering, make_steering, steering_observation
+from sb3_dtfm.policies.online_actor import OnlineActor, make_online_actor, actor_observation
 from sb3_dtfm.windows import (
     Context,
     Windows,
@@ -47,9 +47,9 @@ class ActingPolicy(BasePolicy):
     context_length: int
     chunk_size: int
     n_action_steps: int
-    n_candidates: int
-    candidate_noise: float
-    n_valued: int
+    n_action_samples: int
+    sample_noise_std: float
+    critic_horizon: int
     temperature: float
     kv_cache: bool
     seed: int | None
@@ -61,7 +61,7 @@ class ActingPolicy(BasePolicy):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.steering: Steering | None = None
+        self.online_actor: OnlineActor | None = None
         self._acting_generator: th.Generator | None = None
         self._remembered = RememberedContext()
 
@@ -132,19 +132,19 @@ class ActingPolicy(BasePolicy):
             before = before._replace(plan=nothing.plan, n_planned=nothing.n_planned)
         return before
 
-    def look(
+    def encode(
         self,
         observation: dict[str, np.ndarray],
         state: tuple[np.ndarray, ...] | None = None,
         episode_start: np.ndarray | None = None,
     ) -> tuple[Context, th.Tensor]:
         """
-        The first half of acting, for a caller who chooses the noise: :meth:`act_from_noise` is the second one.
+        The first half of acting, for a caller who chooses the noise: :meth:`decode` is the second one.
 
         A pure function, as `predict` with a `state`.
 
         :param observation: as for :meth:`predict`
-        :param state: what :meth:`act_from_noise` or :meth:`predict` returned; None for no past
+        :param state: what :meth:`decode` or :meth:`predict` returned; None for no past
         :param episode_start: (B,) bool, True where an environment was just reset
         :return: the context with the newest step, and the trunk's hidden states (B, D)
         :raises ValueError: as :meth:`predict`
@@ -160,48 +160,48 @@ class ActingPolicy(BasePolicy):
         assert hidden is not None
         return context._replace(keys_values=keys_values), hidden
 
-    def act_from_noise(self, context: Context, hidden: th.Tensor, noise: np.ndarray) -> tuple[np.ndarray, Context]:
+    def decode(self, context: Context, hidden: th.Tensor, noise: np.ndarray) -> tuple[np.ndarray, Context]:
         """
         The second half: what this noise leads to. Whatever was planned before is dropped.
 
-        :param context: what :meth:`look` returned, with `hidden`
+        :param context: what :meth:`encode` returned, with `hidden`
         :param hidden: (B, D)
         :param noise: (B, N), for the head's `noise_dim`
         :return: actions of this step and of those planned, (B, n_action_steps, A) in the environment's range, and the next
-            `state`; until it is `look`'s turn again, `predict` gives the planned ones
+            `state`; until it is `encode`'s turn again, `predict` gives the planned ones
         :raises ValueError: noise that leads to no finite action
         """
         with th.inference_mode():
             chunks = self._to_chunks(self._decode(hidden, th.as_tensor(noise, dtype=th.float32, device=hidden.device)))
-        return self.carry_out(context, chunks)
+        return self.apply_actions(context, chunks)
 
-    def own_noise(self, context: Context) -> np.ndarray:
+    def default_noise(self, context: Context) -> np.ndarray:
         """
         The noise that `predict(deterministic=True)` begins with.
 
-        :param context: what :meth:`look` returned
+        :param context: what :meth:`encode` returned
         :return: (B, N)
         """
         return self._acting_noise(context.timesteps[:, -1] + context.episode_keys, deterministic=True).cpu().numpy()
 
-    def carry_out(self, context: Context, chunks: np.ndarray) -> tuple[np.ndarray, Context]:
+    def apply_actions(self, context: Context, chunks: np.ndarray) -> tuple[np.ndarray, Context]:
         """
         What comes of actions that somebody else has chosen.
 
-        :param context: what :meth:`look` returned
+        :param context: what :meth:`encode` returned
         :param chunks: (B, h, A) in [-1, 1], for at least the `n_action_steps` that are carried out
-        :return: as :meth:`act_from_noise`
+        :return: as :meth:`decode`
         :raises ValueError: they are not finite
         """
         context = self._carry_out(context, np.ones(len(chunks), bool), chunks)
         planned = np.concatenate([context.actions[:, -1:], context.plan], axis=1)
         return self._to_environment(planned), context
 
-    def steering_observation(
+    def actor_observation(
         self, windows: Windows, hidden: th.Tensor | None, rows: np.ndarray | slice = slice(None)
     ) -> th.Tensor:
         """
-        What a steering chooses by, see :func:`~sb3_dtfm.policies.steering.steering_observation`.
+        The observation of an online actor, see :func:`~sb3_dtfm.policies.online_actor.actor_observation`.
 
         :param windows: arrays (B, K, ...) in the environment's units; the newest step is read
         :param hidden: (b, D), None to leave it out
@@ -209,9 +209,9 @@ class ActingPolicy(BasePolicy):
         :return: (b, F)
         """
         newest = Windows(*(th.from_numpy(each[rows, -1:]).to(self.device) for each in windows))
-        return steering_observation(self.normalization, newest, hidden)
+        return actor_observation(self.normalization, newest, hidden)
 
-    def check_steerable(self) -> int:
+    def check_noise_actions(self) -> int:
         """
         :return: N, numbers of the noise that somebody else may choose
         :raises ValueError: there is no flow
@@ -219,33 +219,33 @@ class ActingPolicy(BasePolicy):
         head = self.network.head
         if not head.noise_dim or not isinstance(self.action_space, spaces.Box):
             name = type(self).__name__.removesuffix("Policy")
-            raise ValueError(f"{name} of {self.action_space} has no flow that could be steered; a DTFM is needed.")
+            raise ValueError(f"{name} of {self.action_space} has no flow whose noise could be chosen; a DTFM is needed.")
         return head.noise_dim
 
-    def check_correctable(self, n_action_steps: int) -> None:
+    def check_residual_actions(self, n_action_steps: int) -> None:
         """
         :param n_action_steps: of each plan
-        :raises ValueError: there is no flow, or its actions cannot be corrected one by one
+        :raises ValueError: there is no flow, or it executes several actions of a chunk
         """
-        self.check_steerable()
+        self.check_noise_actions()
         if n_action_steps > 1:
             raise ValueError(
-                f"n_action_steps={n_action_steps}: corrections are of single actions; "
+                f"n_action_steps={n_action_steps}: residual actions are added to single actions; "
                 "model.policy.set_acting(n_action_steps=1) carries out one of each plan."
             )
 
-    def set_steering(self, settings: dict[str, Any] | None) -> None:
+    def set_online_actor(self, settings: dict[str, Any] | None) -> None:
         """
-        Let a network choose the noise, or correct the actions, from now on; its weights are for the caller to load.
+        Let a network choose the noise, or add a residual action, from now on; its weights are for the caller to load.
 
-        :param settings: of :class:`~sb3_dtfm.policies.steering.Steering`; None draws noise again
+        :param settings: of :class:`~sb3_dtfm.policies.online_actor.OnlineActor`; None draws noise again
         :raises ValueError: the head starts from no noise, or a setting out of range
         """
         if settings is None:
-            self.steering = None
+            self.online_actor = None
             return
-        sizes = (self.observation_dim, self.network.trunk.embed_dim, self.check_steerable(), self.action_dim)
-        self.steering = make_steering(*sizes, settings).to(self.device).requires_grad_(False)
+        sizes = (self.observation_dim, self.network.trunk.embed_dim, self.check_noise_actions(), self.action_dim)
+        self.online_actor = make_online_actor(*sizes, settings).to(self.device).requires_grad_(False)
 
     def reset(self) -> None:
         """Forget the context that `predict` remembers for a caller who passes no `state`."""
@@ -315,15 +315,15 @@ class ActingPolicy(BasePolicy):
         if hidden is None:
             return np.zeros((0, self.chunk_size, self.action_dim), np.float32), keys_values
         rows = context.timesteps[due, -1] + context.episode_keys[due]
-        if self.n_candidates > 1 and self.steering is None:
+        if self.n_action_samples > 1 and self.online_actor is None:
             observations = th.from_numpy(context.observations[due, -1]).to(hidden.device)
             candidates, chosen = self._draw_candidates(hidden, observations, rows, deterministic)
             return self._to_chunks(candidates[th.arange(len(chosen), device=hidden.device), chosen]), keys_values
         noise = self._acting_noise(rows, deterministic).to(hidden.device)
-        if self.steering is None:
+        if self.online_actor is None:
             return self._to_chunks(self._decode(hidden, noise)), keys_values
-        shown = self.steering_observation(context.windows, hidden if self.steering.hidden_state else None, due)
-        return self._to_chunks(self.steering.act(shown, noise, partial(self._decode, hidden))), keys_values
+        shown = self.actor_observation(context.windows, hidden if self.online_actor.hidden_state else None, due)
+        return self._to_chunks(self.online_actor.act(shown, noise, partial(self._decode, hidden))), keys_values
 
     def _hidden(self, context: Context, due: np.ndarray) -> tuple[th.Tensor | None, np.ndarray]:
         """
@@ -364,15 +364,15 @@ class ActingPolicy(BasePolicy):
         :return: (b, N, H A) in [-1, 1], and (b,) int64
         """
         assert self.critic is not None
-        n, turns = self.n_candidates, np.arange(self.n_candidates)
+        n, turns = self.n_action_samples, np.arange(self.n_action_samples)
         noise = self._acting_noise((rows[:, None] + CANDIDATE_STRIDE * turns).ravel(), deterministic).to(hidden.device)
         noise = noise.view(len(hidden), n, -1)
-        noise[:, 1:] *= self.candidate_noise
+        noise[:, 1:] *= self.sample_noise_std
         candidates = self._decode(hidden.repeat_interleave(n, dim=0), noise.flatten(0, 1)).view(len(hidden), n, -1)
         chance = self._acting_noise((rows[:, None] + CHOICE_START + CHOICE_STRIDE * turns).ravel(), deterministic)
         uniform = th.special.ndtr(chance[:, 0]).clamp(1e-6, 1 - 1e-6).view(len(hidden), n).to(hidden.device)
         seen = self.normalization.scale_observation(observations)
-        gains = self.critic.gains(seen, candidates[..., : self.n_valued * self.action_dim])
+        gains = self.critic.gains(seen, candidates[..., : self.critic_horizon * self.action_dim])
         return candidates, self.critic.choose(gains, self.temperature, uniform)
 
     def _acting_noise(self, rows: np.ndarray, deterministic: bool) -> th.Tensor:

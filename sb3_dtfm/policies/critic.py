@@ -17,7 +17,7 @@ LEARNING_RATE = 3e-4
 # What the largest discounted return-to-go becomes.
 LARGEST_VALUE = 10.0
 # How fast the spread of advantages follows the batches.
-SPREAD_SHARE = 0.01
+STD_SHARE = 0.01
 
 
 class Critic(nn.Module):
@@ -36,7 +36,7 @@ class Critic(nn.Module):
 
     batch_size = 256
     reward_scale: th.Tensor
-    spread: th.Tensor
+    advantage_std: th.Tensor
 
     def __init__(self, observation_dim: int, action_dim: int, hidden_dim: int = 256, expectile: float = 0.7) -> None:
         super().__init__()
@@ -45,7 +45,7 @@ class Critic(nn.Module):
         self.q_target = copy.deepcopy(self.q).requires_grad_(False)
         self.value = _mlp(observation_dim, hidden_dim)
         self.register_buffer("reward_scale", th.ones(()))
-        self.register_buffer("spread", th.ones(()))
+        self.register_buffer("advantage_std", th.ones(()))
         trained = [*self.q.parameters(), *self.value.parameters()]
         self.optimizer: th.optim.Optimizer = th.optim.Adam(trained, lr=LEARNING_RATE, fused=True)
 
@@ -98,7 +98,7 @@ class Critic(nn.Module):
             "critic_loss": critic_loss,
             "value_loss": value_loss,
             "q_value": _mean(valued, batch.mask),
-            "advantage_spread": _mean(advantage.square(), batch.mask).sqrt(),
+            "advantage_std": _mean(advantage.square(), batch.mask).sqrt(),
         }
         return critic_loss + value_loss, {name: part.detach() for name, part in parts.items()}
 
@@ -115,7 +115,7 @@ class Critic(nn.Module):
         finite = th.isfinite(loss)
         self.optimizer.found_inf = (~finite).float()  # type: ignore[attr-defined]
         self.optimizer.step()
-        self.spread.lerp_(th.where(finite, parts["advantage_spread"], self.spread), SPREAD_SHARE)
+        self.advantage_std.lerp_(th.where(finite, parts["advantage_std"], self.advantage_std), STD_SHARE)
         # What backups look at moves towards what learns.
         followers = [parameter.data for parameter in self.q_target.parameters()]
         th._foreach_lerp_(followers, [parameter.data for parameter in self.q.parameters()], TARGET_SHARE)
@@ -132,7 +132,7 @@ class Critic(nn.Module):
         :return: (B,) int64
         """
         chance = -(-uniform.log()).log()
-        return (gains + temperature * self.spread * chance).argmax(dim=-1)
+        return (gains + temperature * self.advantage_std * chance).argmax(dim=-1)
 
 
 def _mlp(input_dim: int, hidden_dim: int) -> nn.Sequential:

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from sb3_dtfm.policies.network import SequenceNetwork
 from sb3_dtfm.policies.normalization import Normalization
 from sb3_dtfm.policies.sequence import SequencePolicy
-from sb3_dtfm.policies.steering import steering_observation
+from sb3_dtfm.policies.online_actor import actor_observation
 from sb3_dtfm.windows import Windows
 
 
@@ -32,14 +32,14 @@ class ExportedPolicy(nn.Module):
 
     def __init__(self, policy: SequencePolicy) -> None:
         super().__init__()
-        if policy.n_candidates > 1 and policy.steering is None:
+        if policy.n_action_samples > 1 and policy.online_actor is None:
             raise ValueError(
-                f"n_candidates={policy.n_candidates}: a choice by the critic is not exported; `n_candidates:1` among the "
+                f"n_action_samples={policy.n_action_samples}: a choice by the critic is not exported; `n_action_samples:1` among the "
                 "ways of acting exports the flow alone."
             )
         self.normalization: Normalization = copy.deepcopy(policy.normalization).cpu()
         self.network: SequenceNetwork = copy.deepcopy(policy.acting_network).cpu()
-        self.steering = copy.deepcopy(policy.steering).cpu() if policy.steering is not None else None
+        self.online_actor = copy.deepcopy(policy.online_actor).cpu() if policy.online_actor is not None else None
         self.register_buffer("noise_table", policy.noise_table.cpu())
         self.context_length = policy.context_length
         self.keeps = policy.kv_cache and policy.context_length > 1
@@ -101,12 +101,12 @@ class ExportedPolicy(nn.Module):
         def decode(noise: th.Tensor) -> th.Tensor:
             return head(hidden, noise).clamp(-1.0, 1.0)
 
-        if self.steering is None:
+        if self.online_actor is None:
             chunk = decode(noise)
         else:
             newest = Windows(*(each[:, -1:] for each in (observations, scaled, returns_to_go, timesteps, mask)))
-            shown = steering_observation(self.normalization, newest, hidden if self.steering.hidden_state else None)
-            chunk = self.steering.act(shown, noise, decode)
+            shown = actor_observation(self.normalization, newest, hidden if self.online_actor.hidden_state else None)
+            chunk = self.online_actor.act(shown, noise, decode)
         chunk = chunk.unflatten(1, (-1, self.settings["action_dim"]))
         return self.normalization.unscale_action(chunk), *kept
 

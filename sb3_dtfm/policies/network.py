@@ -5,7 +5,7 @@ import torch as th
 from torch import nn
 
 from sb3_dtfm.heads import ActionHead
-from sb3_dtfm.networks.cpu import hand_out, take_up
+from sb3_dtfm.networks.cpu import make_cache, reserve_cache
 from sb3_dtfm.networks.return_range import ReturnRange
 from sb3_dtfm.networks.trunk import SequenceTrunk
 from sb3_dtfm.windows import Windows
@@ -18,7 +18,7 @@ class SequenceNetwork(nn.Module):
     :param trunk: from normalised windows to hidden states
     :param head: from hidden states to actions
     :param return_range: what the return-to-go is kept within while acting; None leaves it alone
-    :ivar n_products: multiplications of a step of a window on the way forward, without attention's
+    :ivar n_macs: multiplications of a step of a window on the way forward, without attention's
     """
 
     def __init__(self, trunk: SequenceTrunk, head: ActionHead, return_range: ReturnRange | None = None) -> None:
@@ -26,7 +26,7 @@ class SequenceNetwork(nn.Module):
         self.trunk = trunk
         self.head = head
         self.return_range = return_range
-        self.n_products = trunk.tokens_per_step * _n_weights(trunk) + _n_weights(head)
+        self.n_macs = trunk.tokens_per_step * _n_weights(trunk) + _n_weights(head)
 
     def within_range(self, windows: Windows) -> Windows:
         """
@@ -58,10 +58,10 @@ class SequenceNetwork(nn.Module):
         for n_back in range(n_missing, -1, -1):
             earlier = Windows(*(x.roll(n_back, dims=1) for x in windows)) if n_back else windows
             earlier.mask[:, :n_back] = False  # the newest steps went round to the left
-            memory, end = take_up(kept, n_new, device)
+            memory, end = reserve_cache(kept, n_new, device)
             start, end = end - n_kept, end + n_new
             hidden, _ = trunk.extend(**earlier._asdict(), keys_values=memory[..., start:end, :])
-            kept = hand_out(memory, start + n_new, end)
+            kept = make_cache(memory, start + n_new, end)
         return hidden, kept
 
 

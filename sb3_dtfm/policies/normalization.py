@@ -31,7 +31,7 @@ class Normalization(nn.Module):
     :param return_scaling: "timestep" subtracts the mean of the data's returns-to-go at the same time step and divides by
         their standard deviation there: good and bad episodes are as far apart at the last step as at the first one. "max"
         divides by the largest return-to-go of the data, as Decision Transformer does; None makes it zero
-    :param calm_units: what calm episodes spread becomes 1, instead of the standard deviation over all
+    :param observation_scaling: what calm episodes spread becomes 1, instead of the standard deviation over all
     """
 
     observation_mean: th.Tensor
@@ -51,11 +51,11 @@ class Normalization(nn.Module):
         max_timestep: int,
         clip_return_to_go: bool = True,
         return_scaling: str | None = "timestep",
-        calm_units: bool = False,
+        observation_scaling: str = "std",
     ) -> None:
         super().__init__()
         self.max_timestep = max_timestep
-        self.calm_units = calm_units
+        self.observation_scaling = observation_scaling
         self.register_buffer("observation_mean", th.zeros(observation_dim))
         self.register_buffer("observation_std", th.ones(observation_dim))
         self.register_buffer("observation_gain", th.ones(observation_dim))
@@ -74,7 +74,7 @@ class Normalization(nn.Module):
         self,
         observation_mean: np.ndarray,
         observation_std: np.ndarray,
-        observation_unit: np.ndarray,
+        observation_robust_std: np.ndarray,
         return_scale: float,
     ) -> None:
         """
@@ -82,14 +82,14 @@ class Normalization(nn.Module):
 
         :param observation_mean: (O,)
         :param observation_std: (O,), which decides what is clipped, and becomes 1
-        :param observation_unit: (O,), not larger: what becomes 1 with `calm_units`
+        :param observation_robust_std: (O,), not larger: what becomes 1 with `observation_scaling`
         :param return_scale: largest absolute return-to-go, environment reward units
         """
         varies = observation_std > SMALLEST_STD
         self.observation_mean.copy_(th.from_numpy(observation_mean))
         self.observation_std.copy_(th.from_numpy(np.where(varies, observation_std, 1.0)))
-        if self.calm_units:
-            gain = np.divide(observation_std, observation_unit, out=np.ones_like(observation_std), where=varies)
+        if self.observation_scaling:
+            gain = np.divide(observation_std, observation_robust_std, out=np.ones_like(observation_std), where=varies)
             self.observation_gain.copy_(th.from_numpy(gain))
         self.return_scale.fill_(return_scale if return_scale > 0 else 1.0)
 

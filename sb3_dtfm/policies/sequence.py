@@ -51,7 +51,7 @@ ACCEPTED: dict[str, Rule] = {
     "return_scaling": Choice(RETURN_SCALINGS),
     "return_conditioning": BOOLEAN,
     "film_return_to_go": BOOLEAN,
-    "calm_units": BOOLEAN,
+    "observation_scaling": Choice(OBSERVATION_SCALINGS),
     "kv_cache": BOOLEAN,
     "critic_steps": Number(low=0, whole=True),
     "gamma": PROBABILITY_BELOW_1,
@@ -94,15 +94,15 @@ class SequencePolicy(ActingPolicy):
     :param return_scaling: "timestep" or "max", see :class:`~sb3_dtfm.policies.normalization.Normalization`
     :param return_conditioning: learn and act by the return-to-go; without it, the policy clones what was recorded
     :param film_return_to_go: let the return-to-go scale and shift what each block of the trunk gets, besides being a token
-    :param calm_units: scale observations by what calm episodes spread, for data in which some agents' spread far wider; see
+    :param observation_scaling: scale observations by what calm episodes spread, for data in which some agents' spread far wider; see
         :meth:`EpisodeTable.statistics`
     :param critic_steps: with each gradient step, how many a critic takes, which learns what actions are worth so that the
         best of several can be taken, see :class:`~sb3_dtfm.policies.critic.Critic`; trunk and head learn as without. It
         needs a head that draws; 0 for no critic
     :param gamma: discount of a step for the critic
     :param expectile: of the critic
-    :param n_candidates: actions, or chunks, that are drawn each time, of which the critic has one taken; 1 asks no critic
-    :param candidate_noise: standard deviation of the noise that all but the first of them start from; above 1, which the
+    :param n_action_samples: actions, or chunks, that are drawn each time, of which the critic has one taken; 1 asks no critic
+    :param sample_noise_std: standard deviation of the noise that all but the first of them start from; above 1, which the
         flow has learned, they differ more, and the critic has more to choose among
     :param temperature: how much chance that choice leaves, in units of how far actions' values spread in the data; 0, the
         default, takes the one that both values of the critic find better than the first, by the larger gain
@@ -137,12 +137,12 @@ class SequencePolicy(ActingPolicy):
         return_scaling: str = "timestep",
         return_conditioning: bool = True,
         film_return_to_go: bool = True,
-        calm_units: bool = False,
+        observation_scaling: str = "std",
         critic_steps: int = 0,
         gamma: float = 0.99,
         expectile: float = 0.7,
-        n_candidates: int = 1,
-        candidate_noise: float = 1.0,
+        n_action_samples: int = 1,
+        sample_noise_std: float = 1.0,
         temperature: float = 0.0,
         ema: bool = False,
         kv_cache: bool = False,
@@ -166,7 +166,7 @@ class SequencePolicy(ActingPolicy):
             )
         arguments.update(check_arguments(arguments, self._acting_rules()))
         self.n_action_steps = arguments["n_action_steps"]
-        self.n_candidates, self.candidate_noise = arguments["n_candidates"], arguments["candidate_noise"]
+        self.n_action_samples, self.sample_noise_std = arguments["n_action_samples"], arguments["sample_noise_std"]
         self.temperature = arguments["temperature"]
         self._constructor_arguments = {**arguments, **self.head_class.options(), **head_options}
         self.seed = seed
@@ -175,7 +175,7 @@ class SequencePolicy(ActingPolicy):
         self.action_dim = int(self.vector_space.shape[0])
         units = (self.observation_dim, self.vector_space, max_timestep)
         scaling = return_scaling if return_conditioning else None
-        self.normalization = Normalization(*units, clip_return_to_go, scaling, calm_units)
+        self.normalization = Normalization(*units, clip_return_to_go, scaling, observation_scaling)
         sizes = (self.observation_dim, self.action_dim, max_timestep, embed_dim, n_layers, n_heads)
         film = film_return_to_go and return_conditioning
         trunk = SequenceTrunk(*sizes, dropout, timestep_embedding, tokens_per_step, film)
@@ -189,7 +189,7 @@ class SequencePolicy(ActingPolicy):
         generator = th.Generator().manual_seed(0 if seed is None else seed)
         self.register_buffer("noise_table", self.network.head.deterministic_noise(generator))
         self.gamma, self.critic_steps = gamma, arguments["critic_steps"]
-        self.n_valued = self.n_action_steps  # actions that the critic values together: those that are carried out
+        self.critic_horizon = self.n_action_steps  # actions that the critic values together: those that are carried out
         self.critic = None
         if self.critic_steps:  # made last: the weights of all else are what they are without
             if self.network.head.noise_dim == 0:
@@ -197,8 +197,8 @@ class SequencePolicy(ActingPolicy):
                     f"critic_steps={critic_steps}: the critic has nothing to choose among: {self.head_class.algorithm} "
                     "makes one action of what it sees, where DTFM draws."
                 )
-            self.critic = Critic(self.observation_dim, self.n_valued * self.action_dim, expectile=expectile)
-        self._check_candidates(self.n_candidates)
+            self.critic = Critic(self.observation_dim, self.critic_horizon * self.action_dim, expectile=expectile)
+        self._check_candidates(self.n_action_samples)
 
     @classmethod
     def parameter_names(cls) -> set[str]:
@@ -307,7 +307,7 @@ class SequencePolicy(ActingPolicy):
             actions = network.head(hidden, standard_normal(len(hidden), network.head.noise_dim, generator)).clamp(-1.0, 1.0)
             return (actions[:, : self.action_dim] - windows.actions[:, -1]).square().mean()
 
-    def guided_share(self, batch: Windows, generator: th.Generator) -> th.Tensor:
+    def best_of_n_share(self, batch: Windows, generator: th.Generator) -> th.Tensor:
         """
         How often the critic has another candidate taken than the first one, at the newest steps of windows.
 
@@ -340,15 +340,15 @@ class SequencePolicy(ActingPolicy):
         return {
             "kv_cache": BOOLEAN,
             "n_action_steps": Number(low=1, high=self.chunk_size, whole=True),
-            "n_candidates": Number(low=1, high=NOISE_ROWS, whole=True),
-            "candidate_noise": POSITIVE,
+            "n_action_samples": Number(low=1, high=NOISE_ROWS, whole=True),
+            "sample_noise_std": POSITIVE,
             "temperature": NOT_NEGATIVE,
         }
 
-    def _check_candidates(self, n_candidates: int) -> None:
-        if n_candidates > 1 and self.critic is None:
+    def _check_candidates(self, n_action_samples: int) -> None:
+        if n_action_samples > 1 and self.critic is None:
             raise ValueError(
-                f"n_candidates={n_candidates} needs a model that was trained with policy_kwargs=dict(critic_steps=...)."
+                f"n_action_samples={n_action_samples} needs a model that was trained with policy_kwargs=dict(critic_steps=...)."
             )
 
     def set_acting(self, **settings: Any) -> None:
@@ -364,9 +364,9 @@ class SequencePolicy(ActingPolicy):
             raise ValueError(f"{with_nearest(unknown, accepted)}: no way of acting; accepted are {', '.join(accepted)}.")
         settings = {**self.acting_settings(), **settings}
         own = check_arguments(settings, self._acting_rules())
-        self._check_candidates(own["n_candidates"])
-        if self.steering is not None and self.steering.corrects:
-            self.check_correctable(own["n_action_steps"])
+        self._check_candidates(own["n_action_samples"])
+        if self.online_actor is not None and self.online_actor.residual:
+            self.check_residual_actions(own["n_action_steps"])
         heads = self.network.head.check_acting(**{name: settings[name] for name in self.network.head.acting_choices})
         for name, value in own.items():
             setattr(self, name, value)
@@ -398,10 +398,10 @@ class SequencePolicy(ActingPolicy):
         SB3's: the policy alone.
 
         :param path: file to write
-        :raises ValueError: it is steered, which only the model's own file can hold
+        :raises ValueError: it is finetuned, which only the model's own file can hold
         """
-        if self.steering is not None:
-            raise ValueError("A steered policy is saved with its model: model.save(path).")
+        if self.online_actor is not None:
+            raise ValueError("A fine-tuned policy is saved with its model: model.save(path).")
         super().save(path)
 
 

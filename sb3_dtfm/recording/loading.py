@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.files import holds_pickles, read_configuration, read_run
-from sb3_dtfm.finetuning import STEERED, SteeredDTFM
+from sb3_dtfm.finetuning import FINETUNED, FinetunedDTFM
 
 NOT_NORMALIZED = "none"
 
@@ -84,7 +84,7 @@ def _read_run(model: Path, run: Path) -> AgentFiles:
 @functools.cache
 def known_algorithms() -> dict[str, type[BaseAlgorithm]]:
     """Ours, Stable-Baselines3's and sb3-contrib's, by the class name in lower case, which is nearly always RL-Zoo's."""
-    known: dict[str, type[BaseAlgorithm]] = {**ALGORITHMS, STEERED: SteeredDTFM}
+    known: dict[str, type[BaseAlgorithm]] = {**ALGORITHMS, FINETUNED: FinetunedDTFM}
     for module_name in ("stable_baselines3", "sb3_contrib"):
         with contextlib.suppress(ImportError):
             members = inspect.getmembers(importlib.import_module(module_name), inspect.isclass)

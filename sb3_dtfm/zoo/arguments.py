@@ -12,7 +12,7 @@ from rl_zoo3.utils import StoreDict
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.envs import register_gymnasium_robotics
-from sb3_dtfm.finetuning import STEERED
+from sb3_dtfm.finetuning import FINETUNED
 from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, packaged_config
 
 # In a run's settings.
@@ -186,8 +186,8 @@ def train_arguments(argv: Sequence[str]) -> list[str]:
     :raises UsageError: a shorthand for an algorithm that knows no dataset, or one that is missing
     """
     options, rest = train_parser().parse_known_args(argv)
-    if options.algo == STEERED:
-        raise UsageError(f"--algo {STEERED}: such models come from `sb3-dtfm finetune`; `enjoy` plays them.")
+    if options.algo == FINETUNED:
+        raise UsageError(f"--algo {FINETUNED}: such models come from `sb3-dtfm finetune`; `enjoy` plays them.")
     given = key_values("-params", options.hyperparams)
     conf_file = options.conf_file
     if options.algo in ALGORITHMS and conf_file in PACKAGED_CONFIGS:
@@ -266,7 +266,7 @@ def enjoy_arguments(argv: Sequence[str]) -> tuple[float | None, list[str]]:
     :raises UsageError: a target return for an algorithm that asks for none
     """
     options, rest = enjoy_parser().parse_known_args(argv)
-    ours = options.algo in (*ALGORITHMS, STEERED)
+    ours = options.algo in (*ALGORITHMS, FINETUNED)
     if options.target_return is not None and not ours:
         raise UsageError(f"--target-return: for --algo {' and '.join(ALGORITHMS)} only, not for {options.algo}.")
     folder = options.folder or ("logs" if ours else None)

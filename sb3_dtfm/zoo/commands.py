@@ -16,7 +16,7 @@ from rl_zoo3.utils import create_test_env, get_model_path
 
 from sb3_dtfm.files import holds_pickles, read_configuration
 from sb3_dtfm.zoo.comparison import EpisodesOf, compare
-from sb3_dtfm.zoo.finetuning import OnlineManager, SteeringManager
+from sb3_dtfm.zoo.finetuning import OnlineManager, FinetunedManager
 from sb3_dtfm.zoo.manager import OfflineExperimentManager
 from sb3_dtfm.zoo.registration import ONLINE
 
@@ -58,7 +58,7 @@ def finetune(
     evaluations_of_a_run: int | None = None,
 ) -> None:
     """
-    Go on from a DTFM: by :class:`OnlineManager` where it learns itself, else by :class:`SteeringManager`.
+    Go on from a DTFM: by :class:`OnlineManager` where it learns itself, else by :class:`FinetunedManager`.
 
     :param arguments: of RL-Zoo's `train`
     :param model: zip file of the DTFM, or folder of its run
@@ -69,7 +69,7 @@ def finetune(
     :raises TrainingError: training failed in its midst
     :raises SystemExit: SIGTERM has ended it, after what there is was saved
     """
-    kind = OnlineManager if arguments[list(arguments).index("--algo") + 1] == ONLINE else SteeringManager
+    kind = OnlineManager if arguments[list(arguments).index("--algo") + 1] == ONLINE else FinetunedManager
     goes_on = dict(base=model, target_return=target_return, evaluations_of_a_run=evaluations_of_a_run)
     manager = functools.partial(kind, **goes_on, arguments=list(started_with), resumed=resumed)
     rl_zoo3.train.ExperimentManager = manager  # type: ignore[misc,assignment]

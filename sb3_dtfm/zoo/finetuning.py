@@ -1,4 +1,4 @@
-"""RL-Zoo's experiments that go on from a DTFM: an online algorithm steers or corrects it, or it learns by itself."""
+"""RL-Zoo's experiments that go on from a DTFM: noise-space RL, residual RL, or DTFM's own online fine-tuning."""
 
 import inspect
 import os
@@ -18,8 +18,8 @@ from sb3_dtfm.algorithms import DTFM
 from sb3_dtfm.arguments import with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.files import read_run
-from sb3_dtfm.finetuning import STEERED, CorrectionVecEnv, NoiseActionVecEnv, OnlineDTFM, SteeredDTFM
-from sb3_dtfm.finetuning.noise_env import STEERED_SOLVER_STEPS
+from sb3_dtfm.finetuning import FINETUNED, ResidualActionVecEnv, NoiseActionVecEnv, OnlineDTFM, FinetunedDTFM
+from sb3_dtfm.finetuning.noise_env import NOISE_SPACE_FLOW_STEPS
 from sb3_dtfm.finetuning.online import ACCEPTED
 from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.zoo.arguments import UsageError, asking_for
@@ -27,46 +27,46 @@ from sb3_dtfm.zoo.manager import OF_RL_ZOO, OfflineExperimentManager
 from sb3_dtfm.zoo.resuming import EPISODES, StopSignals
 
 # What an algorithm may learn in, by the key of its settings in a run's config.yml, where `enjoy` must not find a wrapper.
-FROZEN_ENVS = {"noise_env": NoiseActionVecEnv, "correction_env": CorrectionVecEnv}
+FROZEN_ENVS = {"noise_env": NoiseActionVecEnv, "residual_env": ResidualActionVecEnv}
 # The online algorithm itself, as Stable-Baselines3 saves it.
 AGENT = "agent"
 # Arguments of an algorithm that the command line gives.
 OF_THE_COMMAND = ("env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model")
 
 
-class SteeredCallbacks(BaseCallback):
+class FinetunedCallbacks(BaseCallback):
     """
-    Have evaluations and checkpoints see the steered model in the place of the algorithm that learns to steer it.
+    Have evaluations and checkpoints see the fine-tuned model in place of the algorithm that learns its online actor.
 
-    Until the algorithm has learned, that is the model without a steering: the curve begins at the offline policy's score.
+    Until the algorithm has learned, that is the model without an actor: the curve begins at the offline policy's score.
 
-    :param steered: acts by the algorithm's actor whenever it is looked at
+    :param finetuned: acts by the algorithm's actor whenever it is looked at
     :param callbacks: to run with it
     :param seed: of the run, which evaluations are seeded by
     :param signals: where one has interrupted the training, the end is not evaluated: what there is is to be saved at once
     """
 
-    def __init__(self, steered: SteeredDTFM, callbacks: list[BaseCallback], seed: int, signals: StopSignals) -> None:
+    def __init__(self, finetuned: FinetunedDTFM, callbacks: list[BaseCallback], seed: int, signals: StopSignals) -> None:
         super().__init__()
-        self.steered = steered
+        self.finetuned = finetuned
         self.signals = signals
         self.evaluations = [each for each in callbacks if isinstance(each, EvalCallback)]
         at_ends = EvaluateAtStartAndEnd(self.evaluations)
         self.inner = CallbackList([SeedEvaluations(self.evaluations, seed), *callbacks, at_ends])
 
     def _init_callback(self) -> None:
-        self.steered.set_logger(self.logger)
+        self.finetuned.set_logger(self.logger)
         for evaluation in self.evaluations:
-            self.steered.n_envs = evaluation.eval_env.num_envs
-            self.steered.set_env(evaluation.eval_env)
-        self.inner.init_callback(self.steered)
+            self.finetuned.n_envs = evaluation.eval_env.num_envs
+            self.finetuned.set_env(evaluation.eval_env)
+        self.inner.init_callback(self.finetuned)
 
     def _on_training_start(self) -> None:
         self._take_over()
         self.inner.on_training_start(self.locals, self.globals)
 
     def _on_step(self) -> bool:
-        self.steered.num_timesteps = self.num_timesteps
+        self.finetuned.num_timesteps = self.num_timesteps
         environment: Any = self.training_env
         self.logger.record("time/environment_steps", environment.n_environment_steps)
         if any((each.n_calls + 1) % freq == 0 for each, freq in self._looking()):
@@ -86,9 +86,9 @@ class SteeredCallbacks(BaseCallback):
         return [(each, frequency) for each, frequency in frequencies if frequency > 0]
 
     def _take_over(self) -> None:
-        self.steered.num_timesteps = self.model.num_timesteps
+        self.finetuned.num_timesteps = self.model.num_timesteps
         if has_learned(self.model):
-            self.steered.steer(self.model)
+            self.finetuned.take_actor(self.model)
 
 
 def has_learned(agent: BaseAlgorithm) -> bool:
@@ -96,22 +96,22 @@ def has_learned(agent: BaseAlgorithm) -> bool:
     return getattr(agent, "_n_updates", 0) > 0
 
 
-def leave_a_choice(policy: SequencePolicy, corrects: bool) -> None:
+def keep_one_action(policy: SequencePolicy, residual: bool) -> None:
     """
     Have a model act in a way that leaves an algorithm something to choose.
 
     :param policy: of the model
-    :param corrects: its actions are corrected, and its noise is not chosen
+    :param residual: whether residual actions are learned, not noise
     """
-    if not corrects and policy.network.head.noise_dim and not policy.network.head.noise_decides:
-        policy.set_acting(n_solver_steps=STEERED_SOLVER_STEPS)
-        print(f"The model acts by one Euler step, which no noise changes: n_solver_steps={STEERED_SOLVER_STEPS} instead")
-    if corrects and policy.n_action_steps > 1:
-        print(f"The model carries out {policy.n_action_steps} actions of each plan; here it is one, which is corrected")
+    if not residual and policy.network.head.noise_dim and not policy.network.head.noise_decides:
+        policy.set_acting(flow_steps=NOISE_SPACE_FLOW_STEPS)
+        print(f"The model acts by one Euler step, which no noise changes: flow_steps={NOISE_SPACE_FLOW_STEPS} instead")
+    if residual and policy.n_action_steps > 1:
+        print(f"n_action_steps={policy.n_action_steps} becomes 1: a residual action is added to each action")
         policy.set_acting(n_action_steps=1)
-    if policy.n_candidates > 1:
-        print(f"The model's critic chooses among {policy.n_candidates} draws; here it acts by one, which is steered")
-        policy.set_acting(n_candidates=1)
+    if policy.n_action_samples > 1:
+        print(f"n_action_samples={policy.n_action_samples} becomes 1: the online algorithm chooses the noise")
+        policy.set_acting(n_action_samples=1)
 
 
 class FinetuningManager(OfflineExperimentManager):
@@ -146,8 +146,8 @@ class FinetuningManager(OfflineExperimentManager):
         known = read_run(run) if (run / "config.yml").is_file() else {}
         if known.get("vec_env_wrapper") and "vec_env_wrapper" not in self.of_the_data:
             raise UsageError(
-                f"--model {self.base}: it learned in {known['vec_env_wrapper']}, where an algorithm that steers needs a "
-                "NoiseActionVecEnv or CorrectionVecEnv; --algo dtfm goes on in it."
+                f"--model {self.base}: it learned in {known['vec_env_wrapper']}, where an online algorithm needs a "
+                "NoiseActionVecEnv or ResidualActionVecEnv; --algo dtfm goes on in it."
             )
         from_the_run = ["env_wrapper", *([] if self.env_kwargs else ["env_kwargs"])]  # of the command line, if given there
         from_the_run += self.of_the_data
@@ -164,20 +164,20 @@ class FinetuningManager(OfflineExperimentManager):
         return hyperparams, OrderedDict(sorted(hyperparams.items()))
 
 
-class SteeringManager(FinetuningManager):
+class FinetunedManager(FinetuningManager):
     """
     An online algorithm learns in a :class:`~sb3_dtfm.finetuning.NoiseActionVecEnv`, or in a
-    :class:`~sb3_dtfm.finetuning.CorrectionVecEnv`.
+    :class:`~sb3_dtfm.finetuning.ResidualActionVecEnv`.
 
-    What is evaluated and saved is the steered model, in the folder of a run of "steered"; beside it the algorithm itself.
+    What is evaluated and saved is the fine-tuned model, in the folder of a run of "finetuned"; beside it the algorithm itself.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.steered = SteeredDTFM.of(DTFM.load(self.base_file, device=self.device))
+        self.finetuned = FinetunedDTFM.of(DTFM.load(self.base_file, device=self.device))
         name = Path(self.save_path).name.removeprefix(f"{self.env_name}_")
         uuid = name.lstrip("0123456789")
-        self.log_path = f"{self.log_folder}/{STEERED}/"
+        self.log_path = f"{self.log_folder}/{FINETUNED}/"
         number = get_latest_run_id(self.log_path, self.env_name) + 1
         self.save_path = os.path.join(self.log_path, f"{self.env_name}_{number}{uuid}")
         self.params_path = f"{self.save_path}/{self.env_name}"
@@ -186,13 +186,13 @@ class SteeringManager(FinetuningManager):
         """Those of the online algorithm, and of the wrapper that it learns in."""
         hyperparams, _ = super().read_hyperparameters()
         key, arguments = self._frozen_env(hyperparams)
-        corrects = FROZEN_ENVS[key] is CorrectionVecEnv
-        print(f"{self.algo.upper()} {'corrects the actions' if corrects else 'chooses the noise'} of {self.base}")
-        leave_a_choice(self.steered.policy, corrects)
+        residual = FROZEN_ENVS[key] is ResidualActionVecEnv
+        print(f"{self.algo.upper()} {'residual the actions' if residual else 'chooses the noise'} of {self.base}")
+        keep_one_action(self.finetuned.policy, residual)
         saved = {name: value for name, value in hyperparams.items() if name != "vec_env_wrapper"}
         saved[key] = {**arguments, "algorithm": self.algo, "model": str(self.base_file)}
         path = f"{FROZEN_ENVS[key].__module__}.{FROZEN_ENVS[key].__name__}"
-        hyperparams["vec_env_wrapper"] = [{path: {**arguments, "model": self.steered}}]
+        hyperparams["vec_env_wrapper"] = [{path: {**arguments, "model": self.finetuned}}]
         return hyperparams, OrderedDict(sorted(saved.items()))
 
     @staticmethod
@@ -212,7 +212,7 @@ class SteeringManager(FinetuningManager):
         return key, dict(arguments or {})
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
-        """RL-Zoo's; the steered model is evaluated in the environment itself."""
+        """RL-Zoo's; the fine-tuned model is evaluated in the environment itself."""
         wrapper = self.vec_env_wrapper
         try:
             if eval_env:
@@ -222,13 +222,13 @@ class SteeringManager(FinetuningManager):
             self.vec_env_wrapper = wrapper
 
     def create_callbacks(self) -> None:
-        """RL-Zoo's; evaluations and checkpoints are of the steered model."""
+        """RL-Zoo's; evaluations and checkpoints are of the fine-tuned model."""
         super().create_callbacks()
         of_the_model: list[BaseCallback] = [
             each for each in self.callbacks if isinstance(each, EvalCallback | CheckpointCallback)
         ]
         others = [each for each in self.callbacks if each not in of_the_model]
-        self.callbacks = [*others, SteeredCallbacks(self.steered, of_the_model, self.seed, self.signals)]
+        self.callbacks = [*others, FinetunedCallbacks(self.finetuned, of_the_model, self.seed, self.signals)]
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """
@@ -239,7 +239,7 @@ class SteeringManager(FinetuningManager):
         result = super().setup_experiment()
         assert result is not None
         try:
-            SteeredDTFM.of(self.steered, result[0])
+            FinetunedDTFM.of(self.finetuned, result[0])
         except ValueError:
             shutil.rmtree(self.save_path)
             raise
@@ -247,15 +247,15 @@ class SteeringManager(FinetuningManager):
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """
-        The steered model where RL-Zoo looks for one, and the algorithm beside it, to go on with.
+        The fine-tuned model where RL-Zoo looks for one, and the algorithm beside it, to go on with.
 
         :param model: the online algorithm
         :raises SystemExit: SIGTERM has ended the run
         """
         print(f"Saving to {self.save_path}")
         if has_learned(model):
-            self.steered.steer(model)
-        self.steered.save(os.path.join(self.save_path, f"{self.env_name}.zip"))
+            self.finetuned.take_actor(model)
+        self.finetuned.save(os.path.join(self.save_path, f"{self.env_name}.zip"))
         model.save(os.path.join(self.save_path, AGENT))
         if self.save_replay_buffer and isinstance(model, OffPolicyAlgorithm):
             model.save_replay_buffer(os.path.join(self.save_path, "replay_buffer.pkl"))

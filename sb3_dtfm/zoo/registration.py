@@ -11,7 +11,7 @@ from rl_zoo3.utils import ALGOS
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.envs import register_gymnasium_robotics
-from sb3_dtfm.finetuning import STEERED, SteeredDTFM
+from sb3_dtfm.finetuning import FINETUNED, FinetunedDTFM
 from sb3_dtfm.policies import SequencePolicy
 
 # What `finetune --algo` calls a DTFM that goes on by itself; its run is one of this algorithm, as any other.
@@ -29,7 +29,7 @@ def register() -> None:
     So do tasks of gymnasium-robotics, which RL-Zoo does not know.
     """
     register_gymnasium_robotics()
-    ALGOS.update({**ALGORITHMS, STEERED: SteeredDTFM})
+    ALGOS.update({**ALGORITHMS, FINETUNED: FinetunedDTFM})
     HYPERPARAMS_SAMPLER.update({name: partial(sample_params, name) for name in ALGORITHMS})
     HYPERPARAMS_CONVERTER.update({name: partial(convert_params, name) for name in ALGORITHMS})
 
@@ -136,5 +136,5 @@ def _sample_trunk(trial: optuna.Trial) -> dict[str, Any]:
         "chunk_size": trial.suggest_categorical("chunk_size", [1, 4, 8, 16]),
         "clip_return_to_go": trial.suggest_categorical("clip_return_to_go", [True, False]),
         "film_return_to_go": trial.suggest_categorical("film_return_to_go", [True, False]),
-        "calm_units": trial.suggest_categorical("calm_units", [True, False]),
+        "observation_scaling": trial.suggest_categorical("observation_scaling", ["std", "robust"]),
     }

@@ -21,8 +21,8 @@ REFUSED = {
     "learning_rate": (0, -1, NAN),
     "ema_decay": (1.0, -0.1, NAN),
     "dataset_fraction": (0, 1.5, NAN),
-    "return_weight": (-1.0, float("inf"), NAN),
-    "return_steps": (-1, 2.5),
+    "return_weighting": (-1.0, float("inf"), NAN),
+    "expected_return_steps": (-1, 2.5),
     "precision": ("float8",),
     "learning_rate_schedule": ("step",),
     "compile": ("yes", 1),
@@ -42,16 +42,16 @@ REFUSED_OF_THE_POLICY = {
     "return_scaling": ("mean", 1),
     "return_conditioning": ("no", 1),
     "film_return_to_go": ("no", None),
-    "calm_units": ("no", 1),
+    "observation_scaling": ("mean", True),
     "kv_cache": ("no", 1),
 }
 REFUSED_OF_THE_FLOW = {
     "flow_hidden_dim": (0, 2.5),
     "flow_n_layers": (0, 2.5),
-    "n_solver_steps": (-1, 2.5),
+    "flow_steps": (-1, 2.5),
     "flow_tau_exponent": (0, NAN),
     "flow_prediction": ("noise",),
-    "solver": ("leapfrog",),
+    "flow_solver": ("leapfrog",),
     "regression_coef": (-1, NAN),
     "one_step": ("no", 0),
 }
@@ -60,7 +60,7 @@ CHOICES = {
     "precision": ("auto", "float32", "bfloat16"),
     "learning_rate_schedule": ("constant", "linear", "cosine"),
     "flow_prediction": ("velocity", "action"),
-    "solver": ("euler", "midpoint", "heun", "rk4", "one_step"),
+    "flow_solver": ("euler", "midpoint", "heun", "rk4", "one_step"),
 }
 
 
@@ -150,9 +150,9 @@ def test_an_unknown_argument_of_the_policy_is_refused_with_those_accepted(algori
         "return_scaling",
         "return_conditioning",
         "film_return_to_go",
-        "calm_units",
+        "observation_scaling",
     }
-    flow = {"flow_hidden_dim", "flow_n_layers", "flow_prediction", "solver", "n_solver_steps", "regression_coef"}
+    flow = {"flow_hidden_dim", "flow_n_layers", "flow_prediction", "flow_solver", "flow_steps", "regression_coef"}
     words = re.findall(r"\w+", str(refusal.value).partition("accepted")[2])
     assert own <= set(words)
     assert flow <= set(words) if algorithm is DTFM else not flow & set(words)
@@ -161,16 +161,16 @@ def test_an_unknown_argument_of_the_policy_is_refused_with_those_accepted(algori
 NUMPY = dict(
     batch_size=np.int64(8), context_length=np.int32(4), learning_rate=np.float32(1e-3), weight_decay=np.float64(0.01),
     warmup_steps=np.int64(2), max_grad_norm=np.float32(0.5), ema_decay=np.float64(0.9),
-    dataset_fraction=np.float32(0.5), dataset_seed=np.int64(1), return_weight=np.float32(5.0),
+    dataset_fraction=np.float32(0.5), dataset_seed=np.int64(1), return_weighting=np.float32(5.0),
 )  # fmt: skip
 NUMPY_POLICY = dict(
     embed_dim=np.int64(16), n_layers=np.int64(1), n_heads=np.int32(2), dropout=np.float32(0.1),
     timestep_embedding=np.False_, tokens_per_step=np.int64(1), kv_cache=np.True_,
     chunk_size=np.int64(3), n_action_steps=np.int64(2), return_conditioning=np.True_, film_return_to_go=np.True_,
-    calm_units=np.True_,
+    observation_scaling=np.str_("robust"),
 )  # fmt: skip
 NUMPY_FLOW = dict(
-    flow_hidden_dim=np.int64(16), flow_n_layers=np.int64(1), flow_tau_exponent=np.float32(1.5), n_solver_steps=np.int64(3),
+    flow_hidden_dim=np.int64(16), flow_n_layers=np.int64(1), flow_tau_exponent=np.float32(1.5), flow_steps=np.int64(3),
     regression_coef=np.float64(0.5),
 )  # fmt: skip
 

@@ -159,7 +159,7 @@ def test_cartpole_is_balanced():
     """As the data's better half does it; the worse one falls after 20 steps."""
     env = DummyVecEnv([lambda: ReturnToGoWrapper(gym.make("CartPole-v1"), target_return=500.0)] * 3)
     model = make_model(
-        DT, cartpole_episodes(20), env=env, batch_size=64, context_length=2, learning_rate=3e-3, return_weight=5.0,
+        DT, cartpole_episodes(20), env=env, batch_size=64, context_length=2, learning_rate=3e-3, return_weighting=5.0,
         policy_kwargs={"tokens_per_step": 1, "n_layers": 1, "timestep_embedding": False},
     ).learn(200)  # fmt: skip
     mean, _ = evaluate_policy(model, env, n_eval_episodes=3, warn=False)

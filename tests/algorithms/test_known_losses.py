@@ -10,11 +10,11 @@ from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 
 TRUNK = dict(
     embed_dim=128, n_layers=3, n_heads=2, dropout=0.0, tokens_per_step=3, timestep_embedding=False, return_scaling="max",
-    clip_return_to_go=False, film_return_to_go=False, calm_units=False, return_conditioning=True,
+    clip_return_to_go=False, film_return_to_go=False, observation_scaling="std", return_conditioning=True,
 )  # fmt: skip
 HEADS = {
     DT: {},
-    DTFM: dict(flow_hidden_dim=256, flow_prediction="action", flow_tau_exponent=2.0, n_solver_steps=1, regression_coef=0.0),
+    DTFM: dict(flow_hidden_dim=256, flow_prediction="action", flow_tau_exponent=2.0, flow_steps=1, regression_coef=0.0),
 }
 # Of every sixth of 30 gradient steps, and the acting policy's action_mse after them.
 KNOWN = {

@@ -44,7 +44,7 @@ def test_one_episode_is_learned_by_heart(algorithm, policy_kwargs):
     buffer = TrajectoryBuffer.from_trajectories([episode], env.unwrapped.action_space)
     overfit = dict(embed_dim=64, n_layers=2, n_heads=2, dropout=0.0)
     if algorithm is DTFM:
-        overfit.update(flow_hidden_dim=128, n_solver_steps=20)
+        overfit.update(flow_hidden_dim=128, flow_steps=20)
     model = make_model(
         algorithm, buffer, policy_kwargs=overfit, learning_rate=2e-3, learning_rate_schedule="cosine", warmup_steps=50,
         weight_decay=0.0, batch_size=32, context_length=10, precision="float32", max_grad_norm=1.0,
@@ -223,24 +223,24 @@ def test_action_prediction_and_tau_near_the_noise_train_and_are_saved(cheetah_bu
 @pytest.mark.parametrize(("algorithm", "policy_kwargs"), ALGORITHMS, ids=IDS)
 def test_without_time_steps_and_with_better_episodes_more_often(algorithm, policy_kwargs, cheetah_buffer, tmp_path):
     policy_kwargs = {**policy_kwargs, "timestep_embedding": False}
-    model = make_model(algorithm, cheetah_buffer, policy_kwargs=policy_kwargs, return_weight=5.0)
+    model = make_model(algorithm, cheetah_buffer, policy_kwargs=policy_kwargs, return_weighting=5.0)
     model.learn(5, log_interval=None).save(tmp_path / "model")
     loaded = algorithm.load(tmp_path / "model")
-    assert loaded.return_weight == 5.0
+    assert loaded.return_weighting == 5.0
     assert loaded.policy.network.trunk.embed_timestep is None
 
 
 def test_expected_returns_are_what_is_learned_from_and_asked_for(cheetah_buffer, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(expected, "N_TIMESTEPS", 20)
-    model = make_model(DTFM, cheetah_buffer, return_steps=10, policy_kwargs=dict(clip_return_to_go=True), verbose=1)
-    assert "Learning which returns may be expected (return_steps=10)" in capsys.readouterr().out
+    model = make_model(DTFM, cheetah_buffer, expected_return_steps=10, policy_kwargs=dict(clip_return_to_go=True), verbose=1)
+    assert "Learning which returns may be expected (expected_return_steps=10)" in capsys.readouterr().out
     wanted = cheetah_buffer.with_expected_returns(10, seed=0)
     assert th.equal(model.buffer.returns_to_go, wanted.returns_to_go)
     assert th.equal(model.policy.normalization.return_to_go_range, wanted.return_to_go_range())
     assert model.score_reference == cheetah_buffer.score_reference
     model.learn(2).save(tmp_path / "model")
     loaded = DTFM.load(tmp_path / "model", dataset=cheetah_buffer)
-    assert loaded.return_steps == 10
+    assert loaded.expected_return_steps == 10
     loaded.learn(1)
     assert th.equal(loaded.buffer.returns_to_go, wanted.returns_to_go)
 

@@ -62,12 +62,12 @@ def test_a_cell_learns_from_all_episodes_or_the_best_tenth_and_leaves_the_rows_o
 ):
     models = []
 
-    class Kept(EvaluationCallback):
+    class KeyValueCache(EvaluationCallback):
         def _on_training_end(self) -> None:
             models.append(self.model)
             super()._on_training_end()
 
-    monkeypatch.setattr(cloning, "EvaluationCallback", Kept)
+    monkeypatch.setattr(cloning, "EvaluationCallback", KeyValueCache)
     write_pendulum(tmp_path / "data.npz")
     task = Task("pushed", str(tmp_path / "data.npz"), -5.0, task="Pendulum-v1", env_kwargs={"max_episode_steps": 8})
     settings = cloning_settings(algo, task_settings("default", "dt", task, 1.0, None, {}), 200)
@@ -85,6 +85,6 @@ def test_a_cell_learns_from_all_episodes_or_the_best_tenth_and_leaves_the_rows_o
     assert [(each["step"], each["final"]) for each in rows] == [(0, False), (100, False), (200, False), (200, True)]
     assert {each: rows[0][each] for each in row} == row
     assert rows[-1]["lengths"] == [8, 8, 8]
-    assert (rows[-1]["solver"], rows[-1]["action_ms"] > 0) == (None, True)
+    assert (rows[-1]["flow_solver"], rows[-1]["action_ms"] > 0) == (None, True)
     assert rows[-1]["data"]["random_return"] < 0
     assert capsys.readouterr().out.startswith("step 0 of 200: evaluation 0/2\n")

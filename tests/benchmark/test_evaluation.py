@@ -133,7 +133,7 @@ def row() -> dict[str, Any]:
 
 
 def make_model(buffer, learning_rate: float = 1e-3) -> DTFM:
-    policy_kwargs = dict(TINY_FLOW_POLICY, solver="heun")
+    policy_kwargs = dict(TINY_FLOW_POLICY, flow_solver="heun")
     settings = dict(batch_size=4, context_length=3, seed=3, device="cpu", policy_kwargs=policy_kwargs)
     return DTFM("MultiInputPolicy", dataset=buffer, learning_rate=learning_rate, **settings)
 
@@ -149,7 +149,7 @@ def test_rows_come_before_during_and_after_training_and_at_the_end_on_other_stat
     steps = [(0, False, 2), (3, False, 2), (6, False, 2), (7, False, 2), (7, True, 4)]
     assert [(each["step"], each["final"], len(each["returns"])) for each in rows] == steps
     assert {each: rows[0][each] for each in row} == row
-    assert {(each["solver"], each["n_solver_steps"]) for each in rows} == {("heun", 4)}
+    assert {(each["flow_solver"], each["flow_steps"]) for each in rows} == {("heun", 4)}
     assert all(each["lengths"] == [5] * len(each["returns"]) and each["successes"] is None for each in rows)
     assert (rows[0]["steps_per_s"], rows[-1]["hardware"]["gpu"]) == (0.0, None)
     assert [each.get("action_ms", 0.0) > 0.0 for each in rows] == [False] * 4 + [True]

@@ -28,7 +28,7 @@ from sb3_dtfm.zoo.arguments import UsageError, asked_for, asking_for
 from tests.recorded import DATASET_ID
 
 TASK = "HalfCheetah-v5"
-POLICY = dict(embed_dim=16, n_layers=1, n_heads=1, flow_hidden_dim=16, flow_n_layers=1, n_solver_steps=2)
+POLICY = dict(embed_dim=16, n_layers=1, n_heads=1, flow_hidden_dim=16, flow_n_layers=1, flow_steps=2)
 SETTINGS = dict(policy="MultiInputPolicy", n_timesteps=6, batch_size=4, context_length=3, policy_kwargs=POLICY)
 STEPS = [(0, False), (2, False), (4, False), (6, False), (6, True)]
 PATIENCE = 120  # seconds to wait for a cell
@@ -105,7 +105,7 @@ def test_a_killed_grid_takes_its_cell_along_goes_on_and_repeats_nothing(grid, wo
         assert each[0]["data"]["recorded_from"].startswith("PPO: ")
         assert each[0]["settings"]["env_kwargs"] == {"max_episode_steps": 10}
         assert (each[0]["regime"], each[0]["hardware"]["threads"]) == (0.5, 1)
-    assert [(each[0]["solver"], each[0]["n_solver_steps"]) for each in (rows["dt"], rows["dtfm"])] == [
+    assert [(each[0]["flow_solver"], each[0]["flow_steps"]) for each in (rows["dt"], rows["dtfm"])] == [
         (None, None),
         ("euler", 2),
     ]
@@ -129,7 +129,7 @@ import json, pathlib, sys, time, yaml
 print("step 3 of 6: training", flush=True)
 if arguments["row"]["algo"] == "dtfm":
     {instead}
-evaluation = dict(step=6, final=True, returns=[1.0] * 3, lengths=[2] * 3, successes=None, solver=None, n_solver_steps=None)
+evaluation = dict(step=6, final=True, returns=[1.0] * 3, lengths=[2] * 3, successes=None, flow_solver=None, flow_steps=None)
 rest = dict(wall_s=1.0, steps_per_s=6.0, commit=None, versions={{}}, hardware={{}})
 pathlib.Path(arguments["rows"]).write_text(json.dumps({{**arguments["row"], **evaluation, **rest}}) + chr(10))
 """
@@ -228,13 +228,13 @@ def test_the_packaged_profiles_differ_in_the_head_only(profile, env_id):
 @pytest.mark.parametrize("nested", [True, False])
 def test_policy_kwargs_of_params_are_merged_and_heads_left_to_their_algorithm(nested):
     """Also where they stand beside the others, by their own names."""
-    kwargs = {"n_solver_steps": 3, "dropout": 0.0, "regression_coef": 0.1}
+    kwargs = {"flow_steps": 3, "dropout": 0.0, "regression_coef": 0.1}
     changes = {**({"policy_kwargs": kwargs} if nested else kwargs), "ema_decay": 0.9}
     dt, dtfm = (task_settings("paper", algo, Task(TASK), 1.0, 7, changes) for algo in ("dt", "dtfm"))
-    assert (dtfm["policy_kwargs"]["n_solver_steps"], dtfm["policy_kwargs"]["regression_coef"]) == (3, 0.1)
+    assert (dtfm["policy_kwargs"]["flow_steps"], dtfm["policy_kwargs"]["regression_coef"]) == (3, 0.1)
     assert dtfm["policy_kwargs"]["embed_dim"] == 256
     assert (dt["policy_kwargs"]["dropout"], dt["ema_decay"], dt["n_timesteps"]) == (0.0, 0.9, 7)
-    assert not {"n_solver_steps", "regression_coef"} & set(dt["policy_kwargs"])
+    assert not {"flow_steps", "regression_coef"} & set(dt["policy_kwargs"])
 
 
 def test_tasks_come_from_a_file_or_from_pairs(tmp_path):

@@ -9,7 +9,7 @@ from tests.benchmark.conftest import make_row
 
 
 def test_a_row_comes_back_as_it_was_written(tmp_path, row):
-    other = make_row(seed=1, successes=None, solver=None, n_solver_steps=None, commit=None)
+    other = make_row(seed=1, successes=None, flow_solver=None, flow_steps=None, commit=None)
     timed = make_row(seed=2, action_ms=1.5, task="lift-10", env_id="robosuite/Lift-v0")
     for each in (row, other, timed):
         write_row(tmp_path / "a.jsonl", each)

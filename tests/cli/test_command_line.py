@@ -137,8 +137,8 @@ def test_hyperparameters_can_be_searched(workplace, capsys):
         ),
         (tiny_training("dt", "gamma", "--dataset", DATASET_ID), "-params gamma: expected key:value with a value in Python"),
         (
-            tiny_training("dtfm", "policy_kwargs:dict(one_step=False,solver='one_step')", "--dataset", DATASET_ID),
-            "solver='one_step' needs a model that was trained with policy_kwargs=dict(one_step=True)",
+            tiny_training("dtfm", "policy_kwargs:dict(one_step_policy=False,flow_solver='one_step')", "--dataset", DATASET_ID),
+            "flow_solver='one_step' needs a model that was trained with policy_kwargs=dict(one_step_policy=True)",
         ),
         (
             ["enjoy", "--algo", "dtfm", *ENJOY],

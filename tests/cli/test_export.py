@@ -27,7 +27,7 @@ def exported(cheetah_buffer, tmp_path_factory):
     (folder / "HalfCheetah-v5" / "config.yml").touch()
     model = make_model(DTFM, cheetah_buffer, policy_kwargs={"chunk_size": 4, "n_action_steps": 1}).learn(5)
     model.save(folder / "HalfCheetah-v5.zip")
-    ways = {"n_solver_steps": 2, "n_action_steps": 3}
+    ways = {"flow_steps": 2, "n_action_steps": 3}
     task = ["--env", "HalfCheetah-v5", "--target-return", "5"]
     acting = ["--acting", *(f"{key}:{value}" for key, value in ways.items())]
     assert main(["export", str(folder), *task, *acting, "--output", str(folder / "policy.onnx")]) == 0
@@ -38,7 +38,7 @@ def exported(cheetah_buffer, tmp_path_factory):
 def test_the_file_has_the_ways_of_acting_that_were_asked_for(exported):
     metadata = ort.InferenceSession(str(exported[1])).get_modelmeta().custom_metadata_map["sb3_dtfm"]
     settings = json.loads(metadata)
-    wanted = {"env_id": "HalfCheetah-v5", "target_return": 5.0, "n_solver_steps": 2, "n_action_steps": 3}
+    wanted = {"env_id": "HalfCheetah-v5", "target_return": 5.0, "flow_steps": 2, "n_action_steps": 3}
     assert wanted.items() <= settings.items()
 
 

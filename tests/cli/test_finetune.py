@@ -1,4 +1,4 @@
-"""`sb3-dtfm finetune`: from a run of `train` to a steered model that `enjoy` plays."""
+"""`sb3-dtfm finetune`: from a run of `train` to a fine-tuned model that `enjoy` plays."""
 
 import signal
 
@@ -10,7 +10,7 @@ from stable_baselines3 import PPO, SAC
 from sb3_dtfm import DTFM
 from sb3_dtfm.cli.main import main
 from sb3_dtfm.data import load_dataset
-from sb3_dtfm.finetuning import OnlineDTFM, SteeredDTFM
+from sb3_dtfm.finetuning import OnlineDTFM, FinetunedDTFM
 from sb3_dtfm.zoo.arguments import asking_for
 from tests.recorded import DATASET_ID, tiny_training
 
@@ -46,47 +46,47 @@ def test_another_target_leaves_the_other_wrappers(before, after):
 def test_a_run_is_finetuned_and_played(run, workplace, capsys):
     arguments = ["--model", str(run), "--algo", "sac", "-tb", "tb", "--save-freq", "12", "-params", *QUICK]
     assert main([*FINETUNE, *arguments]) == 0
-    steered = workplace / "logs/steered/HalfCheetah-v5_1"
-    settings = yaml.unsafe_load((steered / "HalfCheetah-v5/config.yml").read_text())
+    finetuned = workplace / "logs/finetuned/HalfCheetah-v5_1"
+    settings = yaml.unsafe_load((finetuned / "HalfCheetah-v5/config.yml").read_text())
     assert settings["noise_env"]["algorithm"] == "sac"
     assert "vec_env_wrapper" not in settings
     assert settings["env_wrapper"][0]["sb3_dtfm.envs.ReturnToGoWrapper"]["target_return"] == 20000
-    evaluations = np.load(steered / "evaluations.npz")
+    evaluations = np.load(finetuned / "evaluations.npz")
     assert evaluations["timesteps"].tolist() == [0, 10, 20, 24]
     assert evaluations["ep_lengths"].max() == 20, "environment's steps, of the run's own environment"
-    first, last = (SteeredDTFM.load(steered / name) for name in ("rl_model_12_steps", "HalfCheetah-v5"))
-    assert last.steering == {
+    first, last = (FinetunedDTFM.load(finetuned / name) for name in ("rl_model_12_steps", "HalfCheetah-v5"))
+    assert last.online_actor == {
         "layers": [16],
         "activation": "ReLU",
         "squashed": True,
         "bound": 0.7,
         "hidden_state": False,
-        "corrects": False,
+        "residual": False,
     }
-    assert (first.policy.steering.mean.weight != last.policy.steering.mean.weight).any()
-    agent = SAC.load(steered / "agent")
-    np.testing.assert_array_equal(agent.actor.mu.weight.detach(), last.policy.steering.mean.weight)
+    assert (first.policy.online_actor.mean.weight != last.policy.online_actor.mean.weight).any()
+    agent = SAC.load(finetuned / "agent")
+    np.testing.assert_array_equal(agent.actor.mu.weight.detach(), last.policy.online_actor.mean.weight)
     assert list((workplace / "tb").rglob("events*"))
     for more in ([], ["--load-best"], ["--load-checkpoint", "12"]):
         capsys.readouterr()
-        command = ["enjoy", "--algo", "steered", "--env", "HalfCheetah-v5", "--no-render", "-n", "45"]
+        command = ["enjoy", "--algo", "finetuned", "--env", "HalfCheetah-v5", "--no-render", "-n", "45"]
         assert main([*command, *more]) == 0
         assert "Episode Length 20" in capsys.readouterr().out
-    recording = ["--model", str(steered), "--episodes", "2", "--dataset-id", "local/steered-v0"]
-    assert main(["record", "--algo", "steered", "--env", "HalfCheetah-v5", *recording]) == 0
-    assert load_dataset("local/steered-v0").episode_lengths.tolist() == [20, 20]
+    recording = ["--model", str(finetuned), "--episodes", "2", "--dataset-id", "local/finetuned-v0"]
+    assert main(["record", "--algo", "finetuned", "--env", "HalfCheetah-v5", *recording]) == 0
+    assert load_dataset("local/finetuned-v0").episode_lengths.tolist() == [20, 20]
 
 
 def test_the_curve_begins_at_the_offline_policys_score(run, workplace):
     """The steps before the algorithm learns are evaluated as the model that was given, and so is the best model there."""
     assert main([*FINETUNE, "--model", str(run), "-params", *QUICK, "learning_starts:100"]) == 0
-    steered = workplace / "logs/steered/HalfCheetah-v5_1"
-    model = SteeredDTFM.load(steered / "HalfCheetah-v5")
-    assert model.steering is None
-    assert SteeredDTFM.load(steered / "best_model").steering is None
+    finetuned = workplace / "logs/finetuned/HalfCheetah-v5_1"
+    model = FinetunedDTFM.load(finetuned / "HalfCheetah-v5")
+    assert model.online_actor is None
+    assert FinetunedDTFM.load(finetuned / "best_model").online_actor is None
 
 
-def test_steering_that_is_interrupted_is_saved_at_once(run, workplace, capsys, monkeypatch):
+def test_a_run_that_is_interrupted_is_saved_at_once(run, workplace, capsys, monkeypatch):
     """Not after an evaluation, which takes minutes: who sends SIGTERM kills what has not ended soon."""
     train = SAC.train
 
@@ -99,32 +99,32 @@ def test_steering_that_is_interrupted_is_saved_at_once(run, workplace, capsys, m
     with pytest.raises(SystemExit) as ended:
         main([*FINETUNE, "--model", str(run), "-params", *QUICK])
     assert ended.value.code == 128 + signal.SIGTERM
-    steered = workplace / "logs/steered/HalfCheetah-v5_1"
-    assert np.load(steered / "evaluations.npz")["timesteps"].tolist() == [0, 10]
-    assert "Interrupted after 14 decisions; -i logs/steered/HalfCheetah-v5_1/agent.zip" in capsys.readouterr().out
-    model, agent = SteeredDTFM.load(steered / "HalfCheetah-v5"), SAC.load(steered / "agent")
-    np.testing.assert_array_equal(agent.actor.mu.weight.detach(), model.policy.steering.mean.weight)
+    finetuned = workplace / "logs/finetuned/HalfCheetah-v5_1"
+    assert np.load(finetuned / "evaluations.npz")["timesteps"].tolist() == [0, 10]
+    assert "Interrupted after 14 decisions; -i logs/finetuned/HalfCheetah-v5_1/agent.zip" in capsys.readouterr().out
+    model, agent = FinetunedDTFM.load(finetuned / "HalfCheetah-v5"), SAC.load(finetuned / "agent")
+    np.testing.assert_array_equal(agent.actor.mu.weight.detach(), model.policy.online_actor.mean.weight)
 
 
-def test_a_model_that_acts_by_its_mean_action_draws_when_it_is_steered(run, workplace, capsys):
+def test_a_model_that_acts_by_its_mean_action_draws_in_noise_space(run, workplace, capsys):
     """As gaits are packaged: there noise would change nothing."""
     model = DTFM.load(run / "HalfCheetah-v5")
-    model.policy.set_acting(n_solver_steps=1)
+    model.policy.set_acting(flow_steps=1)
     model.save(run / "HalfCheetah-v5")
     assert main([*FINETUNE, "--model", str(run), "-params", *QUICK, "learning_starts:100"]) == 0
-    assert "which no noise changes: n_solver_steps=3 instead" in capsys.readouterr().out
-    steered = SteeredDTFM.load(workplace / "logs/steered/HalfCheetah-v5_1/HalfCheetah-v5")
-    assert steered.policy.acting_settings()["n_solver_steps"] == 3
+    assert "which no noise changes: flow_steps=3 instead" in capsys.readouterr().out
+    finetuned = FinetunedDTFM.load(workplace / "logs/finetuned/HalfCheetah-v5_1/HalfCheetah-v5")
+    assert finetuned.policy.acting_settings()["flow_steps"] == 3
 
 
-def test_where_noise_is_steered_no_critic_chooses(workplace, capsys):
-    critic = ["critic_steps:1", "n_candidates:3", "embed_dim:16", "n_layers:1", "n_heads:1", "flow_hidden_dim:16"]
+def test_where_noise_is_chosen_no_critic_chooses(workplace, capsys):
+    critic = ["critic_steps:1", "n_action_samples:3", "embed_dim:16", "n_layers:1", "n_heads:1", "flow_hidden_dim:16"]
     assert main(tiny_training("dtfm", "dataset:" + repr(DATASET_ID), *critic)) == 0
     run = workplace / "logs/dtfm/HalfCheetah-v5_1"
     assert main([*FINETUNE, "--model", str(run), "-params", *QUICK, "learning_starts:100"]) == 0
-    assert "The model's critic chooses among 3 draws; here it acts by one, which is steered" in capsys.readouterr().out
-    steered = SteeredDTFM.load(workplace / "logs/steered/HalfCheetah-v5_1/HalfCheetah-v5")
-    assert steered.policy.acting_settings()["n_candidates"] == 1
+    assert "n_action_samples=3 becomes 1: the online algorithm chooses the noise" in capsys.readouterr().out
+    finetuned = FinetunedDTFM.load(workplace / "logs/finetuned/HalfCheetah-v5_1/HalfCheetah-v5")
+    assert finetuned.policy.acting_settings()["n_action_samples"] == 1
     config = run / "HalfCheetah-v5" / "config.yml"
     settings = yaml.unsafe_load(config.read_text())
     settings["vec_env_wrapper"] = "stable_baselines3.common.vec_env.VecMonitor"
@@ -148,7 +148,7 @@ def test_ten_evaluations_are_made_where_nothing_is_said(run, workplace):
         *QUICK,
     ]
     assert main(command) == 0
-    evaluations = np.load(workplace / "logs/steered/HalfCheetah-v5_1/evaluations.npz")
+    evaluations = np.load(workplace / "logs/finetuned/HalfCheetah-v5_1/evaluations.npz")
     assert evaluations["timesteps"].tolist() == list(range(0, 41, 4))
 
 
@@ -159,7 +159,7 @@ def test_how_often_a_run_is_evaluated_does_not_change_it(run, workplace, algorit
     for number, every in ((1, "8"), (2, "-1")):
         evaluations = ["--eval-freq", every, "--eval-episodes", "1", "--seed", "1"]
         assert main([*command, *evaluations, "-params", *quick]) == 0
-        actors.append(algorithm.load(workplace / f"logs/steered/HalfCheetah-v5_{number}/agent").policy.state_dict())
+        actors.append(algorithm.load(workplace / f"logs/finetuned/HalfCheetah-v5_{number}/agent").policy.state_dict())
     for name, weights in actors[0].items():
         np.testing.assert_array_equal(weights, actors[1][name], err_msg=name)
 
@@ -169,18 +169,18 @@ def test_ppo_corrects_a_zip_file_with_a_target_of_its_own(run, workplace, capsys
     (workplace / "alone.zip").write_bytes((run / "HalfCheetah-v5.zip").read_bytes())
     target = ["--model", "alone.zip", "--algo", "ppo", "--target-return", "3", "--env-kwargs", "max_episode_steps:20"]
     assert main([*FINETUNE, *target, "-params", *QUICK_PPO]) == 0
-    steered = workplace / "logs/steered/HalfCheetah-v5_1"
-    model = SteeredDTFM.load(steered / "HalfCheetah-v5")
-    agent = PPO.load(steered / "agent")
-    np.testing.assert_array_equal(agent.policy.action_net.weight.detach(), model.policy.steering.mean.weight)
-    assert model.steering["corrects"]
+    finetuned = workplace / "logs/finetuned/HalfCheetah-v5_1"
+    model = FinetunedDTFM.load(finetuned / "HalfCheetah-v5")
+    agent = PPO.load(finetuned / "agent")
+    np.testing.assert_array_equal(agent.policy.action_net.weight.detach(), model.policy.online_actor.mean.weight)
+    assert model.online_actor["residual"]
     assert model.policy.n_action_steps == 1
     output = capsys.readouterr().out
-    assert "PPO corrects the actions of alone.zip" in output
-    assert "The model carries out 2 actions of each plan; here it is one, which is corrected" in output
-    settings = yaml.unsafe_load((steered / "HalfCheetah-v5/config.yml").read_text())
-    assert settings["correction_env"]["bound"] == 0.5
-    assert main(["enjoy", "--algo", "steered", "--env", "HalfCheetah-v5", "--no-render", "-n", "45", "--load-best"]) == 0
+    assert "PPO residual the actions of alone.zip" in output
+    assert "n_action_steps=2 becomes 1: a residual action is added to each action" in output
+    settings = yaml.unsafe_load((finetuned / "HalfCheetah-v5/config.yml").read_text())
+    assert settings["residual_env"]["bound"] == 0.5
+    assert main(["enjoy", "--algo", "finetuned", "--env", "HalfCheetah-v5", "--no-render", "-n", "45", "--load-best"]) == 0
 
 
 def test_a_dtfm_goes_on_from_its_own_episodes(run, workplace, capsys):
@@ -258,9 +258,9 @@ def test_a_run_that_ended_before_its_first_checkpoint_begins_anew(run, workplace
 def test_the_online_algorithm_goes_on_learning(run, workplace, algorithm, quick):
     arguments = ["--model", str(run), "--algo", algorithm.__name__.lower(), "--save-replay-buffer", "-params", *quick]
     assert main([*FINETUNE, *arguments]) == 0
-    agent = workplace / "logs/steered/HalfCheetah-v5_1/agent.zip"
+    agent = workplace / "logs/finetuned/HalfCheetah-v5_1/agent.zip"
     assert main([*FINETUNE, *arguments, "-i", str(agent)]) == 0
-    after = algorithm.load(workplace / "logs/steered/HalfCheetah-v5_2/agent")
+    after = algorithm.load(workplace / "logs/finetuned/HalfCheetah-v5_2/agent")
     assert after._n_updates > algorithm.load(agent)._n_updates
 
 
@@ -277,8 +277,8 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
         f"--model {run} --algo dtfm -params n_episods:3": "n_episods (did you mean n_episodes?): no hyperparameter of",
         f"--model {run} --algo dtfm -i alone.zip": "-i alone.zip: --model names what goes on",
         f"--model {run} --algo dtfm -params verbose:0": "verbose: no hyperparameter of finetune --algo dtfm.",
-        f"--model {run} --algo dtfm -params policy_kwargs:dict(n_candidates=4)": "policy_kwargs: are those of the model",
-        f"--model {run} --algo dtfm -params n_candidates:4": "policy_kwargs: are those of the model",
+        f"--model {run} --algo dtfm -params policy_kwargs:dict(n_action_samples=4)": "policy_kwargs: are those of the model",
+        f"--model {run} --algo dtfm -params n_action_samples:4": "policy_kwargs: are those of the model",
         "--resume logs/dtfm/HalfCheetah-v5_1 --seed 3": "takes no other arguments",
         f"--model {run} -params {wrong}": "expected sb3_dtfm.finetuning.NoiseActionVecEnv or",
         f"--model {run} -params use_sde:True": "its exploration depends on the state (use_sde)",
@@ -288,6 +288,6 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
         capsys.readouterr()
         assert main([*FINETUNE, *arguments.split()]) == 2, arguments
         assert message in capsys.readouterr().err, arguments
-    assert main(["train", "--algo", "steered", "--env", "HalfCheetah-v5"]) == 2
-    assert "--algo steered: such models come from `sb3-dtfm finetune`" in capsys.readouterr().err
-    assert not list((workplace / "logs").glob("steered/*"))
+    assert main(["train", "--algo", "finetuned", "--env", "HalfCheetah-v5"]) == 2
+    assert "--algo finetuned: such models come from `sb3-dtfm finetune`" in capsys.readouterr().err
+    assert not list((workplace / "logs").glob("finetuned/*"))

@@ -47,16 +47,16 @@ def test_two_models_are_asked_for_the_range_of_their_data(workplace, capsys):
     assert all(first == second for _, _, first, second, _ in (row.split("|") for row in rows))
     assert json.loads((workplace / "figures" / "again.json").read_text())["acting"] == {}
     slower = [*twice, *SWEEP, "--returns", "1", "-o", "figures/slower.png", "--acting"]
-    assert main(["sweep", *slower, "n_solver_steps:7"]) == 0
+    assert main(["sweep", *slower, "flow_steps:7"]) == 0
     (asked, _) = json.loads((workplace / "figures" / "slower.json").read_text())["models"].values()
     (as_saved, _) = json.loads((workplace / "figures" / "again.json").read_text())["models"].values()
     assert asked[0]["target"] == as_saved[0]["target"]
     assert asked[0]["returns"] != as_saved[0]["returns"]
-    assert main(["sweep", *slower, "n_solver_steps:-1"]) == 2
+    assert main(["sweep", *slower, "flow_steps:-1"]) == 2
     assert main(["sweep", *slower, "speed:7"]) == 2
     errors = capsys.readouterr().err
-    assert "--acting: n_solver_steps" in errors
-    accepted = "kv_cache, n_action_steps, n_candidates, candidate_noise, temperature, solver, n_solver_steps"
+    assert "--acting: flow_steps" in errors
+    accepted = "kv_cache, n_action_steps, n_action_samples, sample_noise_std, temperature, solver, flow_steps"
     assert f"--acting: speed: no way of acting; accepted are {accepted}." in errors
 
 

@@ -94,7 +94,7 @@ def test_better_episodes_are_drawn_more_often_by_the_weight_of_their_returns():
     def shares(returns: np.ndarray) -> np.ndarray:
         buffer.episodes = buffer.episodes._replace(returns=returns)
         generator = th.Generator().manual_seed(5)
-        batch = next(buffer.batches(n_draws, 1, generator, return_weight=5.0))
+        batch = next(buffer.batches(n_draws, 1, generator, return_weighting=5.0))
         assert batch.timesteps.max() == 299
         return np.bincount(batch.observations[:, 0, 0].long().numpy()) / n_draws
 
@@ -109,7 +109,7 @@ def test_sampling_repeats_with_the_same_seed():
     assert all(th.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
-@pytest.mark.parametrize("choices", [{}, {"return_weight": 5.0}], ids=str)
+@pytest.mark.parametrize("choices", [{}, {"return_weighting": 5.0}], ids=str)
 def test_batches_differ_repeat_with_the_same_seed_and_have_no_end(choices: dict[str, float]):
     buffer = make_buffer([10, 10])
     first, second = (
@@ -131,7 +131,7 @@ def test_batches_are_one_sample_after_the_other():
 def test_batches_take_their_randomness_from_their_generator_alone():
     buffer = make_buffer([10, 10])
     state = th.get_rng_state()
-    next(buffer.batches(32, 5, th.Generator().manual_seed(3), return_weight=5.0))
+    next(buffer.batches(32, 5, th.Generator().manual_seed(3), return_weighting=5.0))
     assert th.equal(th.get_rng_state(), state)
 
 
@@ -332,10 +332,10 @@ def test_a_few_wild_episodes_do_not_set_the_unit():
     buffer = TrajectoryBuffer.from_trajectories(trajectories, ACTION_SPACE, spaces.Box(-np.inf, np.inf, (3,)))
     statistics = buffer.statistics()
     np.testing.assert_allclose(statistics.observation_std, [np.sqrt(80.725), 3.0, 0.0])
-    np.testing.assert_allclose(statistics.observation_unit, [1.0, 3.0, 0.0])
-    assert buffer.select(np.array([0, 8, 9])).statistics().observation_unit[0] == pytest.approx(10.25)
+    np.testing.assert_allclose(statistics.observation_robust_std, [1.0, 3.0, 0.0])
+    assert buffer.select(np.array([0, 8, 9])).statistics().observation_robust_std[0] == pytest.approx(10.25)
     wild = buffer.select(np.array([0, 0, 0, 8])).statistics()
-    assert wild.observation_unit[0] == pytest.approx(0.1 * wild.observation_std[0]) == pytest.approx(0.1 * np.sqrt(100.1875))
+    assert wild.observation_robust_std[0] == pytest.approx(0.1 * wild.observation_std[0]) == pytest.approx(0.1 * np.sqrt(100.1875))
 
 
 def test_a_buffer_on_its_own_device_stays_as_it_is():

@@ -40,23 +40,23 @@ def test_an_agents_actions_are_taken_one_by_one_and_at_their_mean():
     buffer = make_buffer("agent")
     assert prediction_errors(buffer).plan_ratio() < 0.2
     decided = settings(buffer)
-    assert (decided["chunk_size"], decided["n_solver_steps"], decided["regression_coef"]) == (1, 0, 1.0)
+    assert (decided["chunk_size"], decided["flow_steps"], decided["regression_coef"]) == (1, 0, 1.0)
 
 
 def test_a_planners_actions_are_drawn_in_chunks():
     buffer = make_buffer("planner")
     assert prediction_errors(buffer).plan_ratio() > 5.0
     decided = settings(buffer)
-    assert (decided["chunk_size"], decided["n_solver_steps"], decided["regression_coef"]) == (8, 10, 0.0)
+    assert (decided["chunk_size"], decided["flow_steps"], decided["regression_coef"]) == (8, 10, 0.0)
     assert decided["timestep_embedding"]
-    assert not decided["calm_units"]
+    assert decided["observation_scaling"] == "std"
 
 
 def test_a_planners_noise_takes_robust_units():
     buffer = make_buffer("planner")
     buffer.actions += 0.1 * th.randn(buffer.actions.shape, generator=th.Generator().manual_seed(0))
     decided = settings(buffer)
-    assert (decided["chunk_size"], decided["calm_units"]) == (8, True)
+    assert (decided["chunk_size"], decided["observation_scaling"]) == (8, "robust")
 
 
 def test_a_decision_repeats_and_leaves_the_data_alone():
@@ -78,14 +78,14 @@ def test_too_little_to_tell_is_taken_for_an_agents(n_episodes, n_steps):
 @pytest.mark.parametrize(("kind", "expected"), [("ladder", (True, 5.0, 50)), ("agent", (False, 0.0, None))])
 def test_returns_count_where_they_tell_how_an_episode_acts(kind, expected):
     decided = settings(make_buffer(kind))
-    assert tuple(decided.get(name) for name in ("return_conditioning", "return_weight", "return_steps")) == expected
+    assert tuple(decided.get(name) for name in ("return_conditioning", "return_weighting", "expected_return_steps")) == expected
 
 
 def test_returns_are_not_expected_where_a_reward_tells_of_success_alone():
     buffer = make_buffer("ladder")
     buffer.rewards[buffer.timesteps < 39] = 0.0
     decided = settings(buffer)
-    assert (decided["return_steps"], decided["return_range"]) == (0, False)
+    assert (decided["expected_return_steps"], decided["return_range"]) == (0, False)
 
 
 def test_returns_that_are_all_alike_tell_nothing():
@@ -115,22 +115,22 @@ def test_white_noise_takes_back_half_of_what_it_did():
 
 def test_what_a_user_gives_counts():
     buffer = make_buffer("planner")
-    given = DTFM("MultiInputPolicy", dataset=buffer, batch_size=32, policy_kwargs={"n_solver_steps": 0}, device="cpu")
-    assert (given.batch_size, given.policy.acting_settings()["n_solver_steps"], given.policy.chunk_size) == (32, 0, 8)
+    given = DTFM("MultiInputPolicy", dataset=buffer, batch_size=32, policy_kwargs={"flow_steps": 0}, device="cpu")
+    assert (given.batch_size, given.policy.acting_settings()["flow_steps"], given.policy.chunk_size) == (32, 0, 8)
     decided = DTFM("MultiInputPolicy", dataset=buffer, device="cpu")
-    assert (decided.batch_size, decided.policy.acting_settings()["n_solver_steps"], decided.policy.chunk_size) == (64, 10, 8)
+    assert (decided.batch_size, decided.policy.acting_settings()["flow_steps"], decided.policy.chunk_size) == (64, 10, 8)
 
 
 def test_what_is_decided_goes_with_what_a_user_gives():
     def loss_and_steps(kind: str, **policy_kwargs) -> tuple:
         model = DTFM("MultiInputPolicy", dataset=make_buffer(kind), policy_kwargs=policy_kwargs, device="cpu")
-        return model.policy.network.head.regression_coef, model.policy.network.head.n_solver_steps
+        return model.policy.network.head.regression_coef, model.policy.network.head.flow_steps
 
-    assert loss_and_steps("planner", n_solver_steps=5) == (0.0, 5)
-    assert loss_and_steps("planner", n_solver_steps=0) == (1.0, 0)
-    assert loss_and_steps("agent", n_solver_steps=5) == (1.0, 5)
+    assert loss_and_steps("planner", flow_steps=5) == (0.0, 5)
+    assert loss_and_steps("planner", flow_steps=0) == (1.0, 0)
+    assert loss_and_steps("agent", flow_steps=5) == (1.0, 5)
     assert loss_and_steps("agent", regression_coef=0.0) == (0.0, 10)
-    assert loss_and_steps("agent", critic_steps=1, n_candidates=4) == (1.0, 10), "a critic chooses among draws"
+    assert loss_and_steps("agent", critic_steps=1, n_action_samples=4) == (1.0, 10), "a critic chooses among draws"
 
 
 def test_people_are_told_each_reason_once():

@@ -1,4 +1,4 @@
-"""That steering learns which of two ways is rewarded, and correcting what to add where actions fall short."""
+"""That noise-space RL learns which of two ways is rewarded, and residual RL what to add where actions fall short."""
 
 import gymnasium as gym
 import numpy as np
@@ -11,7 +11,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from sb3_dtfm import DTFM
 from sb3_dtfm.data import Trajectory
 from sb3_dtfm.envs import ReturnToGoWrapper
-from sb3_dtfm.finetuning import CorrectionVecEnv, NoiseActionVecEnv, SteeredDTFM
+from sb3_dtfm.finetuning import ResidualActionVecEnv, NoiseActionVecEnv, FinetunedDTFM
 
 N_STEPS = 2
 
@@ -47,7 +47,7 @@ def demonstrations():
 
 def small_flow(data: list[Trajectory], n_steps: int = 400) -> DTFM:
     trunk = dict(embed_dim=16, n_layers=1, n_heads=1, dropout=0.0, tokens_per_step=1, clip_return_to_go=True)
-    flow = dict(flow_hidden_dim=32, flow_n_layers=2, n_solver_steps=5, flow_prediction="action", one_step=False)
+    flow = dict(flow_hidden_dim=32, flow_n_layers=2, flow_steps=5, flow_prediction="action", one_step_policy=False)
     settings = dict(context_length=1, batch_size=64, learning_rate=3e-3, learning_rate_schedule="cosine", seed=0)
     return DTFM("MultiInputPolicy", None, data, device="cpu", policy_kwargs={**trunk, **flow}, **settings).learn(n_steps)
 
@@ -68,8 +68,8 @@ def test_sac_finds_the_noise_whose_actions_are_rewarded():
     learning = dict(learning_starts=200, gradient_steps=4, learning_rate=3e-3, batch_size=64, gamma=0.5, ent_coef=0.01)
     agent = SAC("MlpPolicy", NoiseActionVecEnv(venv, model), seed=0, policy_kwargs=dict(net_arch=[32, 32]), **learning)
     agent.learn(1200)
-    steered, _ = evaluate_policy(SteeredDTFM.of(model, agent), evaluated, n_eval_episodes=100)
-    assert steered > 0.9
+    finetuned, _ = evaluate_policy(FinetunedDTFM.of(model, agent), evaluated, n_eval_episodes=100)
+    assert finetuned > 0.9
 
 
 class Targets(Sides):
@@ -98,6 +98,6 @@ def test_ppo_adds_what_the_demonstrations_fall_short_of():
     assert offline == pytest.approx(2 * (1.0 - 0.24), abs=0.1)
     policy_kwargs = dict(log_std_init=-2.0, net_arch=[32, 32])
     learning = dict(n_steps=128, batch_size=128, learning_rate=3e-3, gamma=0.5, policy_kwargs=policy_kwargs)
-    agent = PPO("MlpPolicy", CorrectionVecEnv(venv, model), seed=0, device="cpu", **learning).learn(10_000)
-    corrected, _ = evaluate_policy(SteeredDTFM.of(model, agent), evaluated, n_eval_episodes=100)
-    assert corrected > 2 * 0.93
+    agent = PPO("MlpPolicy", ResidualActionVecEnv(venv, model), seed=0, device="cpu", **learning).learn(10_000)
+    residual, _ = evaluate_policy(FinetunedDTFM.of(model, agent), evaluated, n_eval_episodes=100)
+    assert residual > 2 * 0.93

@@ -57,7 +57,7 @@ def make_venv(lengths=(7, 10, 4), for_good=(False, True, False), vec_env_cls=Dum
 
 @pytest.fixture(params=[{}, CHUNKS, {**CHUNKS, "kv_cache": True}], ids=["single", "chunks", "cached"])
 def model(request, cheetah_buffer):
-    policy_kwargs = {"return_scaling": "timestep", "calm_units": True, **request.param}
+    policy_kwargs = {"return_scaling": "timestep", "observation_scaling": "robust", **request.param}
     return make_model(DTFM, cheetah_buffer, ema_decay=0.9, policy_kwargs=policy_kwargs).learn(5)
 
 
@@ -128,7 +128,7 @@ def test_what_is_shown_is_in_the_units_of_the_data(model):
     np.testing.assert_allclose(shown[:, 18], 0.0)
     assert shown.shape == (3, 17 + 2 + 32)
     assert env.observation_space.contains(shown[0])
-    _, hidden = model.policy.look(raw)
+    _, hidden = model.policy.encode(raw)
     np.testing.assert_allclose(shown[:, 19:], hidden.numpy(), atol=1e-5)
 
 
@@ -150,7 +150,7 @@ def test_the_last_observation_of_an_episode_has_its_own_hidden_state(model):
     observations, _, _, steps = going_on.venv.step_wait()
     if model.policy.n_action_steps > 1:  # the seventh step is the first one of the third chunk
         observations = {key: value[:, 0] for key, value in _stacked(steps).items()}
-    shown = going_on._show(*policy.look(observations, going_on._acted))
+    shown = going_on._show(*policy.encode(observations, going_on._acted))
     np.testing.assert_allclose(infos[0]["terminal_observation"], shown[0], atol=1e-4)
     assert context.timesteps[0, -1] == 6
 
@@ -211,8 +211,8 @@ def test_environment_steps_are_counted():
         assert env.n_environment_steps == n_steps
 
 
-def test_what_cannot_be_steered_is_refused():
-    with pytest.raises(ValueError, match=r"DT of Box.* has no flow that could be steered; a DTFM is needed"):
+def test_what_has_no_noise_to_choose_is_refused():
+    with pytest.raises(ValueError, match=r"DT of Box.* has no flow whose noise could be chosen; a DTFM is needed"):
         NoiseActionVecEnv(make_venv(), _tiny(DT))
     cart = dict(observations=np.zeros((9, 4)), actions=np.array([0, 1] * 4 + [0]), rewards=np.ones(9))
     env = make_vec_env("CartPole-v1", wrapper_class=ReturnToGoWrapper, wrapper_kwargs=dict(target_return=9.0))
@@ -226,6 +226,6 @@ def test_what_cannot_be_steered_is_refused():
     with pytest.raises(ValueError, match="bound must be a number above 0, got -1"):
         NoiseActionVecEnv(make_venv(), _tiny(), bound=-1)
     mean_action = _tiny()
-    mean_action.policy.set_acting(n_solver_steps=1)
-    with pytest.raises(ValueError, match=r"one step of Euler ends at the mean action.*set_acting\(n_solver_steps=3\)"):
+    mean_action.policy.set_acting(flow_steps=1)
+    with pytest.raises(ValueError, match=r"one step of Euler ends at the mean action.*set_acting\(flow_steps=3\)"):
         NoiseActionVecEnv(make_venv(), mean_action)

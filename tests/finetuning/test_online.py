@@ -146,7 +146,7 @@ def test_the_seed_is_the_environments_too(file, cheetah_buffer):
 
 def test_own_returns_are_expected_ones_as_the_datasets_are(file, cheetah_buffer, monkeypatch):
     monkeypatch.setattr("sb3_dtfm.data.expected.N_TIMESTEPS", 100)
-    model = OnlineDTFM.load(file, make_venv(), dataset=cheetah_buffer, return_steps=2, **ONLINE)
+    model = OnlineDTFM.load(file, make_venv(), dataset=cheetah_buffer, expected_return_steps=2, **ONLINE)
     model.set_dataset(cheetah_buffer)
     model.replay_buffer = cheetah_buffer.best(best_share=0.2)
     asked = []
@@ -180,9 +180,9 @@ def test_own_episodes_are_saved_and_taken_up(model, tmp_path):
 
 
 def test_a_critic_learns_of_all_episodes(cheetah_buffer, tmp_path):
-    policy_kwargs = dict(CHUNKS, critic_steps=2, n_candidates=4)
-    make_model(DTFM, cheetah_buffer, policy_kwargs=policy_kwargs).learn(2).save(tmp_path / "guided.zip")
-    model = OnlineDTFM.load(tmp_path / "guided.zip", make_venv(), dataset=cheetah_buffer, **ONLINE)
+    policy_kwargs = dict(CHUNKS, critic_steps=2, n_action_samples=4)
+    make_model(DTFM, cheetah_buffer, policy_kwargs=policy_kwargs).learn(2).save(tmp_path / "critic.zip")
+    model = OnlineDTFM.load(tmp_path / "critic.zip", make_venv(), dataset=cheetah_buffer, **ONLINE)
     model.set_dataset(episodes([0.0] * 4, [None] * 4, first=0.0))
     model.replay_buffer = episodes([-1e3] * 4, [False] * 4)
     generator = th.Generator().manual_seed(0)
@@ -239,7 +239,7 @@ def test_episodes_that_had_ended_survive_an_interrupt(model):
 def test_a_turn_that_was_interrupted_while_it_learned_is_learned_to_its_end(file, cheetah_buffer, tmp_path, monkeypatch):
     settings = dict(ONLINE, gradient_steps=5)
     model = OnlineDTFM.load(file, make_venv(), dataset=cheetah_buffer, **settings)
-    before, step = model._n_updates, OnlineDTFM._train_step
+    before, step = model._n_updates, OnlineDTFM.train
 
     def interrupted(self, *args):
         if self._n_updates == before + 2:
@@ -247,7 +247,7 @@ def test_a_turn_that_was_interrupted_while_it_learned_is_learned_to_its_end(file
         step(self, *args)
 
     with monkeypatch.context() as patch:
-        patch.setattr(OnlineDTFM, "_train_step", interrupted)
+        patch.setattr(OnlineDTFM, "train", interrupted)
         with pytest.raises(KeyboardInterrupt):
             model.learn(9)
     model.save(tmp_path / "checkpoint.zip")

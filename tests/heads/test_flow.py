@@ -25,15 +25,15 @@ def test_velocity_agrees_with_the_papers_form_away_from_its_singularity():
     assert th.allclose(velocity, (action - x) / (1 - tau), atol=1e-5)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize("n_solver_steps", [1, 7])
-def test_a_predicted_action_is_where_every_solver_ends(solver, n_solver_steps):
+@pytest.mark.parametrize("flow_solver", SOLVERS)
+@pytest.mark.parametrize("flow_steps", [1, 7])
+def test_a_predicted_action_is_where_every_solver_ends(solver, flow_steps):
     head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_prediction="action")
     action = th.tensor([0.3, -0.8])
     with th.no_grad():
         head.regression.linear.weight.zero_()
         head.regression.linear.bias.copy_(action.atanh())
-        th.testing.assert_close(head.solve(th.randn(5, 4), th.randn(5, 2), solver, n_solver_steps), action.expand(5, 2))
+        th.testing.assert_close(head.solve(th.randn(5, 4), th.randn(5, 2), solver, flow_steps), action.expand(5, 2))
 
 
 @pytest.mark.parametrize("prediction", PREDICTIONS)
@@ -71,19 +71,19 @@ def test_taus_are_spread_evenly_from_a_random_start_and_taken_in_turn():
     assert in_turn(tau, 3).equal(tau[:, :3])
 
 
-@pytest.mark.parametrize("n_solver_steps", [1, 3, 50])
-def test_a_predicted_action_stays_within_the_bounds(n_solver_steps):
+@pytest.mark.parametrize("flow_steps", [1, 3, 50])
+def test_a_predicted_action_stays_within_the_bounds(flow_steps):
     head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_prediction="action")
     with th.no_grad():
         head.regression.linear.weight.mul_(1000.0)
-        actions = head.solve(10 * th.randn(500, 4), th.randn(500, 2), "euler", n_solver_steps)
+        actions = head.solve(10 * th.randn(500, 4), th.randn(500, 2), "euler", flow_steps)
     assert 0.9 < actions.abs().max() < 1.0 + 1e-6
 
 
 @pytest.mark.parametrize("prediction", PREDICTIONS)
 def test_paths_lead_from_the_noise_to_the_actions(prediction):
     head = FlowHead(
-        embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_prediction=prediction, solver="euler", n_solver_steps=9
+        embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_prediction=prediction, flow_solver="euler", flow_steps=9
     )
     nn.init.normal_(head.vector_field.output.weight)
     hidden, noise = th.randn(5, 4), th.randn(5, 2)
@@ -107,7 +107,7 @@ def test_a_head_that_predicts_actions_starts_as_decision_transformers():
 
 
 def test_its_one_step_network_starts_so_too_and_leaves_the_regression_alone():
-    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_prediction="action", one_step=True)
+    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_prediction="action", one_step_policy=True)
     hidden, noise = th.randn(3, 4), th.randn(3, 2)
     th.testing.assert_close(head.one_step_action(hidden, noise), head.solve(hidden, noise, "euler", 1))
     nn.init.normal_(head.vector_field.output.weight)
@@ -116,10 +116,10 @@ def test_its_one_step_network_starts_so_too_and_leaves_the_regression_alone():
     assert moved == {name for name, _ in head.named_parameters() if name.startswith("one_step.")}
 
 
-@pytest.mark.parametrize(("n_solver_steps", "expected"), [(3, 3), (50, 16)])
-def test_the_one_step_network_learns_where_the_solver_of_the_settings_ends(n_solver_steps, expected):
-    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, n_solver_steps=n_solver_steps, one_step=True)
-    head.n_solver_steps = 1  # as it acts later changes nothing
+@pytest.mark.parametrize(("flow_steps", "expected"), [(3, 3), (50, 16)])
+def test_the_one_step_network_learns_where_the_solver_of_the_settings_ends(flow_steps, expected):
+    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_steps=flow_steps, one_step_policy=True)
+    head.flow_steps = 1  # as it acts later changes nothing
     hidden, noise = th.randn(3, 4), th.randn(3, 2)
     error = head.one_step_action(hidden, noise) - head.solve(hidden, noise, "euler", expected).clamp(-1.0, 1.0)
     loss = head.one_step_loss(hidden, th.ones(3, dtype=th.bool), noise)
@@ -127,7 +127,7 @@ def test_the_one_step_network_learns_where_the_solver_of_the_settings_ends(n_sol
 
 
 def test_the_mean_action_and_the_hidden_state_are_learned_by_the_regression_alone():
-    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, n_solver_steps=0)
+    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_steps=0)
     assert not head.noise_decides
     nn.init.normal_(head.vector_field.output.weight)
     hidden, actions, mask = th.randn(3, 5, 4, requires_grad=True), th.rand(3, 5, 2), th.ones(3, 5, dtype=th.bool)
@@ -140,13 +140,13 @@ def test_the_mean_action_and_the_hidden_state_are_learned_by_the_regression_alon
 
 
 def test_the_mean_action_needs_a_regression():
-    with pytest.raises(ValueError, match=r"n_solver_steps=0 needs .*regression_coef"):
-        FlowHead(embed_dim=4, action_dim=2, n_solver_steps=0, regression_coef=0.0)
+    with pytest.raises(ValueError, match=r"flow_steps=0 needs .*regression_coef"):
+        FlowHead(embed_dim=4, action_dim=2, flow_steps=0, regression_coef=0.0)
 
 
 def test_parts_of_the_loss_add_up():
     """Flow, auxiliary regression by its weight, and the one-step network."""
-    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, regression_coef=0.5, one_step=True)
+    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, regression_coef=0.5, one_step_policy=True)
     hidden, actions, mask = th.randn(3, 5, 4), th.rand(3, 5, 2), th.ones(3, 5, dtype=th.bool)
     loss, parts = head.loss(hidden, actions, mask, th.randn(3, 5, 2), th.rand(3, 5))
     assert set(parts) == {"flow_loss", "regression_loss", "one_step_loss"}
@@ -158,7 +158,7 @@ def test_a_flow_head_learns_two_modes_that_regression_would_average(prediction):
     th.manual_seed(0)
     generator = th.Generator().manual_seed(0)
     sizes = dict(embed_dim=4, action_dim=1, flow_hidden_dim=64, flow_n_layers=2)
-    head = FlowHead(**sizes, flow_prediction=prediction, one_step=True)
+    head = FlowHead(**sizes, flow_prediction=prediction, one_step_policy=True)
     optimizer = th.optim.Adam(head.parameters(), 3e-3)
     hidden, mask = th.zeros(256, 1, 4), th.ones(256, 1, dtype=th.bool)
     for _ in range(400):

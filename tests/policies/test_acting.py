@@ -16,7 +16,7 @@ ALGORITHMS = [(DT, TINY_POLICY), (DTFM, TINY_FLOW_POLICY)]
 ONE_TOKEN_OPTIONS = {"tokens_per_step": 1, "film_return_to_go": True, "return_scaling": "timestep"}
 ONE_TOKEN = [(algorithm, {**policy_kwargs, **ONE_TOKEN_OPTIONS}) for algorithm, policy_kwargs in ALGORITHMS]
 CHUNKS = [(algorithm, {**policy_kwargs, "chunk_size": 4, "n_action_steps": 3}) for algorithm, policy_kwargs in ONE_TOKEN]
-UNGUIDED = {"n_candidates": 1, "candidate_noise": 1.0, "temperature": 0.0}
+ONE_SAMPLE = {"n_action_samples": 1, "sample_noise_std": 1.0, "temperature": 0.0}
 IDS = [f"{algorithm}{variant}" for variant in ("", ", one token", ", chunks") for algorithm in ("dt", "dtfm")]
 
 
@@ -181,11 +181,11 @@ def test_a_policy_alone_acts_and_values_as_it_did(cheetah_buffer, tmp_path):
     """How many actions are carried out may have been changed since the critic learned to value so many."""
     kwargs = dict(TINY_FLOW_POLICY, chunk_size=4, critic_steps=1)
     model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=kwargs)
-    model.policy.set_acting(n_action_steps=1, n_candidates=3)
+    model.policy.set_acting(n_action_steps=1, n_action_samples=3)
     model.policy.save(str(tmp_path / "policy.pt"))
     loaded = DTFMPolicy.load(str(tmp_path / "policy.pt"))
     assert loaded.acting_settings() == model.policy.acting_settings()
-    assert loaded.n_valued == model.policy.n_valued == 2
+    assert loaded.critic_horizon == model.policy.critic_horizon == 2
 
 
 def test_solver_can_be_changed_after_training(cheetah_buffer):
@@ -316,11 +316,11 @@ def test_parallel_environments_with_a_cache_act_as_they_would_alone(model):
 
 
 def test_one_step_acting_is_one_evaluation_saved_with_the_model(cheetah_buffer, tmp_path):
-    policy_kwargs = {**TINY_FLOW_POLICY, "solver": "one_step", "kv_cache": True}
+    policy_kwargs = {**TINY_FLOW_POLICY, "flow_solver": "one_step", "kv_cache": True}
     model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=policy_kwargs, batch_size=16, seed=0).learn(5)
     model.save(tmp_path / "model.zip")
     loaded = DTFM.load(tmp_path / "model.zip")
-    settings = {"solver": "one_step", "n_solver_steps": 4, "kv_cache": True, "n_action_steps": 1, **UNGUIDED}
+    settings = {"flow_solver": "one_step", "flow_steps": 4, "kv_cache": True, "n_action_steps": 1, **ONE_SAMPLE}
     assert loaded.policy.acting_settings() == settings
     assert np.array_equal(roll_plain(model, 8), roll_plain(loaded, 8))
     model.policy.set_solver("euler", 10)
@@ -333,15 +333,15 @@ def test_a_way_of_acting_that_was_chosen_after_training_is_saved(cheetah_buffer,
     model.policy.set_acting(kv_cache=True)
     model.save(tmp_path / "model.zip")
     loaded = DTFM.load(tmp_path / "model.zip")
-    settings = {"solver": "heun", "n_solver_steps": 3, "kv_cache": True, "n_action_steps": 1, **UNGUIDED}
+    settings = {"flow_solver": "heun", "flow_steps": 3, "kv_cache": True, "n_action_steps": 1, **ONE_SAMPLE}
     assert loaded.policy.acting_settings() == settings
     assert np.array_equal(roll_plain(model, 8), roll_plain(loaded, 8))
 
 
 def test_one_step_acting_needs_a_model_that_learned_it(cheetah_buffer):
-    policy_kwargs = {**TINY_FLOW_POLICY, "one_step": False}
+    policy_kwargs = {**TINY_FLOW_POLICY, "one_step_policy": False}
     model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=policy_kwargs, seed=0)
-    with pytest.raises(ValueError, match="one_step=True"):
+    with pytest.raises(ValueError, match="one_step_policy=True"):
         model.policy.set_solver("one_step")
 
 
@@ -352,7 +352,7 @@ def test_the_one_step_network_changes_nothing_else(cheetah_buffer):
         model = DTFM(
             "MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=policy_kwargs, batch_size=8, max_grad_norm=0.5, seed=0
         ).learn(5)
-        weights.append({name: p for name, p in model.policy.network.named_parameters() if "head.one_step" not in name})
+        weights.append({name: p for name, p in model.policy.network.named_parameters() if "head.one_step_policy" not in name})
     with_it, without_it = weights
     assert with_it.keys() == without_it.keys()
     assert all(th.equal(with_it[name], without_it[name]) for name in with_it)

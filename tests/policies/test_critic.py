@@ -78,7 +78,7 @@ def test_a_step_whose_loss_is_not_finite_is_not_learned_from():
     for name, tensor in critic.state_dict().items():
         assert th.equal(tensor, before[name]), name
     critic.learn(batch)
-    assert not th.equal(critic.spread, before["spread"])
+    assert not th.equal(critic.advantage_std, before["spread"])
     assert not th.equal(critic.value[0].weight, before["value.0.weight"])
 
 
@@ -107,8 +107,8 @@ def two_ways() -> TrajectoryBuffer:
 SETTINGS = dict(context_length=1, batch_size=64, learning_rate=1e-2)
 
 
-def guided(buffer: TrajectoryBuffer, **policy_kwargs) -> DTFM:
-    kwargs = dict(critic_steps=1, dropout=0.0, flow_prediction="action", one_step=False, n_solver_steps=8, **policy_kwargs)
+def with_critic(buffer: TrajectoryBuffer, **policy_kwargs) -> DTFM:
+    kwargs = dict(critic_steps=1, dropout=0.0, flow_prediction="action", one_step_policy=False, flow_steps=8, **policy_kwargs)
     return make_model(DTFM, buffer, policy_kwargs=kwargs, **SETTINGS)
 
 
@@ -135,28 +135,28 @@ def decided(two_ways) -> DTFM:
         "two ways",
     )
     blind.returns_to_go.fill_(0.5)
-    return guided(blind).learn(600, log_interval=None)
+    return with_critic(blind).learn(600, log_interval=None)
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
 def test_the_critic_takes_the_better_of_two_ways(decided, deterministic):
-    decided.policy.set_acting(n_candidates=1)
+    decided.policy.set_acting(n_action_samples=1)
     assert 0.3 < went_right(decided, deterministic) < 0.7
-    decided.policy.set_acting(n_candidates=8, temperature=0.0)
+    decided.policy.set_acting(n_action_samples=8, temperature=0.0)
     assert went_right(decided, deterministic) > 0.95
     decided.policy.set_acting(temperature=1e6)  # chance alone
     assert 0.3 < went_right(decided, deterministic) < 0.7
 
 
 def test_a_choice_repeats_and_is_saved(decided, tmp_path):
-    decided.policy.set_acting(n_candidates=4, temperature=0.1)
+    decided.policy.set_acting(n_action_samples=4, temperature=0.1)
     decided.save(tmp_path / "model.zip")
     loaded = DTFM.load(tmp_path / "model.zip")
     assert loaded.policy.acting_settings() == decided.policy.acting_settings()
     assert went_right(loaded) == went_right(decided) == went_right(decided)
 
 
-@pytest.mark.parametrize("solver", ["euler", "one_step"])
+@pytest.mark.parametrize("flow_solver", ["euler", "one_step"])
 def test_of_the_draws_the_most_valuable_one_is_taken(cheetah_buffer, solver):
     model = make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=3, chunk_size=3)).learn(4)
     assert {int(state["step"]) for state in model.policy.critic.optimizer.state.values()} == {3 * 4}
@@ -169,15 +169,15 @@ def test_of_the_draws_the_most_valuable_one_is_taken(cheetah_buffer, solver):
     }
     first, gains = None, {}
     seen = model.policy.normalization.scale_observation(observation)
-    for n_candidates in (1, 8, 32):
-        model.policy.set_acting(solver=solver, n_candidates=n_candidates)
+    for n_action_samples in (1, 8, 32):
+        model.policy.set_acting(flow_solver=solver, n_action_samples=n_action_samples)
         _, state = model.predict(observations, deterministic=True, episode_start=np.ones(50, bool))
         context = Context(*state)
-        planned = np.concatenate([context.actions[:, -1:], context.plan], axis=1)[:, : model.policy.n_valued].reshape(50, -1)
+        planned = np.concatenate([context.actions[:, -1:], context.plan], axis=1)[:, : model.policy.critic_horizon].reshape(50, -1)
         first = planned if first is None else first
         with th.no_grad():
             both = th.from_numpy(np.stack([first, planned], axis=1))
-            gains[n_candidates] = model.policy.critic.gains(seen, both)[:, 1].numpy()
+            gains[n_action_samples] = model.policy.critic.gains(seen, both)[:, 1].numpy()
     assert (gains[8] >= -1e-6).all()
     assert (gains[32] >= gains[8] - 1e-6).all()
     assert (gains[32] > 1e-4).mean() > 0.5
@@ -193,36 +193,36 @@ def test_another_action_is_worth_more_where_both_values_say_so():
     assert critic.choose(critic.gains(seen, actions), 0.0, th.full((2, 3), 0.5)).tolist() == [0, 0]
 
 
-@pytest.mark.parametrize("candidate_noise", [1.0, 1.5])
-def test_candidates_start_from_noise_as_wide_as_is_said(cheetah_buffer, candidate_noise):
+@pytest.mark.parametrize("sample_noise_std", [1.0, 1.5])
+def test_candidates_start_from_noise_as_wide_as_is_said(cheetah_buffer, sample_noise_std):
     policy = make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=1)).policy
     policy.set_training_mode(False)
-    policy.set_acting(n_candidates=4, candidate_noise=candidate_noise)
+    policy.set_acting(n_action_samples=4, sample_noise_std=sample_noise_std)
     hidden = th.randn(5, policy.network.trunk.embed_dim, generator=th.Generator().manual_seed(0))
     rows = np.arange(5)
     with th.no_grad():
         candidates, _ = policy._draw_candidates(hidden, cheetah_buffer.observations[:5], rows, deterministic=True)
         for turn in range(4):
             noise = policy.noise_table[th.from_numpy(rows + CANDIDATE_STRIDE * turn) % len(policy.noise_table)]
-            width = candidate_noise if turn else 1.0  # the first is the action without a critic
+            width = sample_noise_std if turn else 1.0  # the first is the action without a critic
             th.testing.assert_close(candidates[:, turn], policy._decode(hidden, width * noise))
-    with pytest.raises(ValueError, match="candidate_noise"):
-        policy.set_acting(candidate_noise=0.0)
+    with pytest.raises(ValueError, match="sample_noise_std"):
+        policy.set_acting(sample_noise_std=0.0)
 
 
 def test_what_chooses_by_value_is_not_exported(cheetah_buffer, tmp_path):
-    model = make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=1, n_candidates=4))
-    with pytest.raises(ValueError, match="n_candidates=4: a choice by the critic is not exported"):
+    model = make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=1, n_action_samples=4))
+    with pytest.raises(ValueError, match="n_action_samples=4: a choice by the critic is not exported"):
         model.export(tmp_path / "policy.onnx")
     assert not list(tmp_path.iterdir())
 
 
 def test_trunk_and_flow_learn_as_without(cheetah_buffer):
-    plain, guided = (
+    plain, critic = (
         make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=n, chunk_size=3)).learn(5) for n in (0, 2)
     )
     for name, weight in plain.policy.network.state_dict().items():
-        assert th.equal(guided.policy.network.state_dict()[name], weight), name
+        assert th.equal(critic.policy.network.state_dict()[name], weight), name
 
 
 def test_going_on_is_the_same_to_the_bit(cheetah_buffer, tmp_path):
@@ -240,30 +240,30 @@ def test_going_on_is_the_same_to_the_bit(cheetah_buffer, tmp_path):
 
 
 def test_values_are_logged(cheetah_buffer):
-    model = make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=1, n_candidates=4))
+    model = make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=1, n_action_samples=4))
     curves = record_curves(model)
     model.learn(4, log_interval=2)
-    for name in ("critic_loss", "value_loss", "q_value", "guided_share"):
+    for name in ("critic_loss", "value_loss", "q_value", "best_of_n_share"):
         points = curves.points[f"train/{name}"]
         assert [step for step, _ in points] == [2, 4]
         assert np.isfinite([value for _, value in points]).all()
-    assert 0 <= curves.points["train/guided_share"][-1][1] <= 1
+    assert 0 <= curves.points["train/best_of_n_share"][-1][1] <= 1
 
 
 def test_what_cannot_choose_says_why(cheetah_buffer):
     with pytest.raises(ValueError, match="critic_steps=1: the critic has nothing to choose among: DT makes one action"):
         make_model(DT, cheetah_buffer, policy_kwargs=dict(critic_steps=1))
     with pytest.raises(
-        ValueError, match=r"n_candidates=4 needs a model that was trained with policy_kwargs=dict\(critic_steps="
+        ValueError, match=r"n_action_samples=4 needs a model that was trained with policy_kwargs=dict\(critic_steps="
     ):
-        make_model(DTFM, cheetah_buffer, policy_kwargs=dict(n_candidates=4))
+        make_model(DTFM, cheetah_buffer, policy_kwargs=dict(n_action_samples=4))
     model = make_model(DTFM, cheetah_buffer)
-    with pytest.raises(ValueError, match="n_candidates=2 needs"):
-        model.policy.set_acting(n_candidates=2)
+    with pytest.raises(ValueError, match="n_action_samples=2 needs"):
+        model.policy.set_acting(n_action_samples=2)
 
 
 def test_a_file_without_its_critic_is_refused(cheetah_buffer, tmp_path):
-    make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=1)).learn(1).save(tmp_path / "guided.zip")
+    make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=1)).learn(1).save(tmp_path / "critic.zip")
     plain = make_model(DTFM, cheetah_buffer).learn(1)
     with pytest.raises(ModelFileError, match="critic"):
-        plain.set_parameters(str(tmp_path / "guided.zip"))
+        plain.set_parameters(str(tmp_path / "critic.zip"))

@@ -31,18 +31,18 @@ EVERYTHING = {
     "film_return_to_go": True,
     "return_scaling": "timestep",
     "clip_return_to_go": True,
-    "calm_units": True,
+    "observation_scaling": "robust",
     "timestep_embedding": False,
     "flow_prediction": "action",
-    "solver": "heun",
-    "n_solver_steps": 2,
+    "flow_solver": "heun",
+    "flow_steps": 2,
 }
 VARIANTS = {
     "dt": (DT, {}),
     "dtfm, one token, chunks and the other options": (DTFM, EVERYTHING),
     "dtfm, kept keys and values, chunks": (DTFM, {**CHUNKS, "kv_cache": True}),
     "dtfm": (DTFM, {}),
-    "dtfm, one step": (DTFM, {"solver": "one_step"}),
+    "dtfm, one step": (DTFM, {"flow_solver": "one_step"}),
     "dt, one token, chunks": (DT, {**CHUNKS, "tokens_per_step": 1}),
     "dt, one token, kept keys and values": (DT, {"tokens_per_step": 1, "kv_cache": True}),
 }

@@ -12,7 +12,7 @@ T = 100
 
 
 def make_normalization(**options: bool) -> Normalization:
-    options = {"clip_return_to_go": False, "calm_units": True, **options}
+    options = {"clip_return_to_go": False, "observation_scaling": "robust", **options}
     normalization = Normalization(2, spaces.Box(-1.0, 1.0, (1,)), T, **options)
     normalization.set_statistics(np.array([1.0, 5.0]), np.array([2.0, 0.0]), np.array([0.5, 0.0]), 300.0)
     return normalization
@@ -61,5 +61,5 @@ def test_a_policy_without_return_conditioning_sees_none():
 
 
 def test_the_unit_is_the_standard_deviation_unless_asked_for():
-    normalized = make_normalization(calm_units=False)(make_windows([2.0, 6.0], 0.0, 0))
+    normalized = make_normalization(observation_scaling="std")(make_windows([2.0, 6.0], 0.0, 0))
     assert normalized.observations.flatten().tolist() == [0.5, 1.0]

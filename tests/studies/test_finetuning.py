@@ -21,7 +21,7 @@ def test_a_run_is_measured_and_shown(workplace):
     evaluated = ["--eval-freq", "40", "--eval-episodes", "3", "--eval-env-kwargs", "max_episode_steps:22"]
     assert main([*command, *evaluated]) == 0
     cell = Cell("HalfCheetah-v5", 1.0, "dtfm", 0, "tiny")
-    like = dict(cell._asdict(), settings={"batch_size": 4}, data={"n_episodes": 3}, solver="euler", n_solver_steps=1)
+    like = dict(cell._asdict(), settings={"batch_size": 4}, data={"n_episodes": 3}, flow_solver="euler", flow_steps=1)
     (workplace / "rows").mkdir()
     run = workplace / "logs/dtfm/HalfCheetah-v5_2"
     shutil.copy(before / "HalfCheetah-v5.zip", run / "best_model.zip")  # one that is known not to be the last
@@ -51,7 +51,7 @@ def test_a_run_is_measured_and_shown(workplace):
     assert (workplace / "curves.png").stat().st_size > 5000
 
 
-def test_a_steered_run_is_measured_where_its_decisions_are_steps(workplace):
+def test_a_noise_space_run_is_measured_where_its_decisions_are_steps(workplace):
     for chunk_size, number in ((1, 1), (4, 2)):
         settings = f"policy_kwargs:dict(embed_dim=16,n_layers=1,n_heads=1,flow_hidden_dim=16,chunk_size={chunk_size})"
         assert main(tiny_training("dtfm", "dataset:" + repr(DATASET_ID), settings)) == 0
@@ -68,14 +68,14 @@ def test_a_steered_run_is_measured_where_its_decisions_are_steps(workplace):
         assert main([*command, "--eval-freq", "20", "--eval-episodes", "3"]) == 0
     (workplace / "rows").mkdir()
     cell = Cell("HalfCheetah-v5", 1.0, "dtfm", 0, "tiny")
-    like = dict(cell._asdict(), settings={"batch_size": 4}, data={"n_episodes": 3}, solver="euler", n_solver_steps=1)
-    steered = workplace / "logs/steered"
-    finetuning.measure(steered / "HalfCheetah-v5_1", before, like, "steered", workplace / "rows")
-    rows = read_rows(workplace / "rows" / f"{cell._replace(label='steered').file_name}.jsonl")
+    like = dict(cell._asdict(), settings={"batch_size": 4}, data={"n_episodes": 3}, flow_solver="euler", flow_steps=1)
+    finetuned = workplace / "logs/finetuned"
+    finetuning.measure(finetuned / "HalfCheetah-v5_1", before, like, "finetuned", workplace / "rows")
+    rows = read_rows(workplace / "rows" / f"{cell._replace(label='finetuned').file_name}.jsonl")
     assert [row["step"] for row in rows] == [0, 20, 40, 40]
     assert rows[-1]["settings"]["noise_env"]["algorithm"] == "sac"
     with pytest.raises(SystemExit, match="its timesteps are decisions of several actions"):
-        finetuning.measure(steered / "HalfCheetah-v5_2", before, like, "steered", workplace / "rows")
+        finetuning.measure(finetuned / "HalfCheetah-v5_2", before, like, "finetuned", workplace / "rows")
 
 
 def test_attempts_are_shown_by_the_steps_they_took(tmp_path, monkeypatch):

@@ -17,5 +17,5 @@ def test_environments_are_timed_alone_and_behind_a_wrapper(algo):
 
 
 def test_what_is_not_packaged_is_refused():
-    with pytest.raises(SystemExit, match=r"ppo.*Hopper-v5.*NoiseActionVecEnv, not CorrectionVecEnv"):
+    with pytest.raises(SystemExit, match=r"ppo.*Hopper-v5.*NoiseActionVecEnv, not ResidualActionVecEnv"):
         list(finetuning_speed.measure_algorithm("ppo", "Hopper-v5", 1, "dummy", 0.1))

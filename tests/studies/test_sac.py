@@ -39,7 +39,7 @@ def test_recorded_steps_lie_in_the_replay_buffer():
 def test_a_run_is_evaluated(tmp_path, monkeypatch):
     cell = Cell("Pendulum-v1", 1.0, "dtfm", 3, "tiny")
     about = dict(
-        settings={"dataset": "none"}, data={}, solver="euler", n_solver_steps=1, commit=None, versions={}, hardware={}
+        settings={"dataset": "none"}, data={}, flow_solver="euler", flow_steps=1, commit=None, versions={}, hardware={}
     )
     episodes = dict(returns=[0.0], lengths=[200], successes=None, step=0, final=True, wall_s=0.0, steps_per_s=0.0)
     write_row(tmp_path / "like.jsonl", {**cell._asdict(), **about, **episodes})

@@ -18,4 +18,4 @@ def test_products_of_a_layer_are_its_own_and_two_gradients():
 def test_a_step_has_nothing_left_to_decide(name):
     model = make_model(name)
     assert not {each.name for each in model.decisions} & set(STEPS[name][-1])
-    assert model.return_weight == 0.0
+    assert model.return_weighting == 0.0

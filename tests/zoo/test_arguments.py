@@ -117,9 +117,9 @@ def test_a_run_has_the_options_of_its_policy_and_the_settings_files_others(workp
         "  policy_kwargs: {embed_dim: 16, n_layers: 1, n_heads: 1, flow_hidden_dim: 16, flow_n_layers: 1}\n"
     )
     command = [*tiny_training("dtfm")[:9], "--conf-file", "mine.yml", "--eval-freq", "-1", "-params"]
-    assert main([*command, "critic_steps:1", "n_candidates:3"]) == 0
+    assert main([*command, "critic_steps:1", "n_action_samples:3"]) == 0
     model = DTFM.load(workplace / "logs/dtfm/HalfCheetah-v5_1/HalfCheetah-v5")
-    assert model.policy_kwargs.items() >= {"embed_dim": 16, "critic_steps": 1, "n_candidates": 3}.items()
+    assert model.policy_kwargs.items() >= {"embed_dim": 16, "critic_steps": 1, "n_action_samples": 3}.items()
     assert model.policy.critic is not None
     assert "critic_steps" in (workplace / "logs/dtfm/HalfCheetah-v5_1/HalfCheetah-v5/config.yml").read_text()
     assert main([*command, "flow_layers:1"]) == 2

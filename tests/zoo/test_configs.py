@@ -87,15 +87,15 @@ def test_the_papers_settings():
         "return_scaling": "max",
         "clip_return_to_go": False,
         "film_return_to_go": False,
-        "calm_units": False,
+        "observation_scaling": "std",
         "flow_hidden_dim": 512,
         "flow_n_layers": 3,
         "flow_prediction": "velocity",
         "flow_tau_exponent": 1.0,
         "regression_coef": 0.0,
-        "one_step": True,
-        "solver": "euler",
-        "n_solver_steps": 50,
+        "one_step_policy": True,
+        "flow_solver": "euler",
+        "flow_steps": 50,
     }
     del default["policy_kwargs"]
     assert default == {
@@ -108,8 +108,8 @@ def test_the_papers_settings():
         "warmup_steps": 0,
         "weight_decay": 1e-3,
         "ema_decay": 0.0,
-        "return_weight": 0.0,
-        "return_steps": 0,
+        "return_weighting": 0.0,
+        "expected_return_steps": 0,
         "precision": "auto",
     }
 
@@ -135,7 +135,7 @@ def test_a_search_can_find_the_packaged_settings(algo, settings):
     defaults.update(policy.head_class.options())
     for hyperparams in load(algo, settings).values():
         policy_kwargs = copy.copy(hyperparams.get("policy_kwargs", {}))
-        for key in {"solver", "one_step", "return_scaling", "return_conditioning", "regression_coef"} & set(
+        for key in {"flow_solver", "one_step", "return_scaling", "return_conditioning", "regression_coef"} & set(
             policy_kwargs
         ):  # not searched for
             del policy_kwargs[key]

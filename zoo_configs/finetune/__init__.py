@@ -1,1 +1,1 @@
-"""Settings of the online algorithms that steer or correct a frozen DTFM, and of a DTFM that goes on by itself."""
+"""Settings of the online algorithms: noise-space RL, residual RL, and DTFM's own online fine-tuning."""

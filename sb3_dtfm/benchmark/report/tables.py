@@ -374,7 +374,7 @@ def _sources(group: Group) -> list[str]:
         f"{each.get('gpu') or each.get('cpu')} ({each.get('threads')} of {each.get('cores')} cores)"
         for each in (row["hardware"] for row in finals)
     }
-    solvers = {f"{row['solver']}, {row['n_solver_steps']} steps" for row in finals if row["solver"] is not None}
+    solvers = {f"{row['flow_solver']}, {row['flow_steps']} steps" for row in finals if row["flow_solver"] is not None}
     versions = {f"torch {row['versions'].get('torch', '?')}" for row in finals}
     lines += [f"- machines: {'; '.join(sorted(machines))}", f"- solver: {'; '.join(sorted(solvers)) or NONE}"]
     return [*lines, f"- versions: {', '.join(sorted(versions))}"]

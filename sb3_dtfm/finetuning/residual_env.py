@@ -1,4 +1,4 @@
-"""The environment that an online algorithm sees: its actions are corrections of a frozen policy's own."""
+"""The environment that an online algorithm sees: its actions are residual actions, added to those of a frozen policy (Johannink et al., 2019)."""
 
 from os import PathLike
 
@@ -14,10 +14,10 @@ from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.windows import Context
 
 # Of actions between -1 and 1.
-CORRECTION_BOUND = 0.5
+RESIDUAL_BOUND = 0.5
 
 
-class CorrectionVecEnv(FrozenPolicyVecEnv):
+class ResidualActionVecEnv(FrozenPolicyVecEnv):
     """
     Acts with a frozen DTFM, and adds what somebody else chooses to its actions: residual reinforcement learning (Johannink
     et al., 2019; Silver et al., 2018). A choice of zeros is what the DTFM does with `deterministic=True`.
@@ -28,7 +28,7 @@ class CorrectionVecEnv(FrozenPolicyVecEnv):
 
     :param venv: environments wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
     :param model: a DTFM that carries out single actions without a critic's choice, or the path to a saved one
-    :param bound: largest correction, of actions between -1 and 1
+    :param bound: largest residual action, in units of actions in [-1, 1]
     :param hidden_state: show the trunk's hidden state as well
     :raises ValueError: a policy that is no flow, carries out several actions of a plan or has its critic choose,
         environments that do not fit it, or an argument out of range
@@ -38,7 +38,7 @@ class CorrectionVecEnv(FrozenPolicyVecEnv):
         self,
         venv: VecEnv,
         model: OfflineSequenceAlgorithm | str | PathLike[str],
-        bound: float = CORRECTION_BOUND,
+        bound: float = RESIDUAL_BOUND,
         hidden_state: bool = False,
     ) -> None:
         super().__init__(venv, model, bound, hidden_state)
@@ -47,10 +47,10 @@ class CorrectionVecEnv(FrozenPolicyVecEnv):
 
     @staticmethod
     def _action_space(policy: SequencePolicy, bound: float) -> spaces.Box:
-        policy.check_correctable(policy.n_action_steps)
-        if policy.n_candidates > 1:
+        policy.check_residual_actions(policy.n_action_steps)
+        if policy.n_action_samples > 1:
             raise ValueError(
-                f"n_candidates={policy.n_candidates}: corrections are of one draw; model.policy.set_acting(n_candidates=1) "
+                f"n_action_samples={policy.n_action_samples}: residual actions are added to one sample; model.policy.set_acting(n_action_samples=1) "
                 "leaves the critic out."
             )
         return spaces.Box(-bound, bound, (policy.action_dim,), np.float32)
@@ -73,11 +73,11 @@ class CorrectionVecEnv(FrozenPolicyVecEnv):
         return shown
 
     def _show(self, context: Context, hidden: th.Tensor) -> np.ndarray:
-        _, acted = self.policy.act_from_noise(context, hidden, self.policy.own_noise(context))
+        _, acted = self.policy.decode(context, hidden, self.policy.default_noise(context))
         return np.concatenate([super()._show(context, hidden), acted.actions[:, -1]], axis=1)
 
     def _act(self, context: Context, hidden: th.Tensor, actions: np.ndarray) -> tuple[np.ndarray, Context]:
         if not np.isfinite(actions).all():
-            raise ValueError(f"A correction must be finite numbers, got {actions[~np.isfinite(actions).all(axis=1)][0]}.")
-        corrections = np.clip(actions, -self.bound, self.bound)
-        return self.policy.carry_out(context, np.clip(self._own + corrections, -1.0, 1.0)[:, None])
+            raise ValueError(f"A residual action must be finite numbers, got {actions[~np.isfinite(actions).all(axis=1)][0]}.")
+        residuals = np.clip(actions, -self.bound, self.bound)
+        return self.policy.apply_actions(context, np.clip(self._own + residuals, -1.0, 1.0)[:, None])

@@ -1,4 +1,4 @@
-"""A DTFM and the steering that was learned for it, as one model."""
+"""A DTFM and the noise policy or residual policy that was learned for it, as one model."""
 
 import io
 from typing import Any, NoReturn
@@ -10,84 +10,84 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
 from sb3_dtfm.algorithms import DTFM
-from sb3_dtfm.finetuning.correction_env import CorrectionVecEnv
+from sb3_dtfm.finetuning.residual_env import ResidualActionVecEnv
 from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
 from sb3_dtfm.policies import SequencePolicy
-from sb3_dtfm.policies.steering import ACTIVATIONS
+from sb3_dtfm.policies.online_actor import ACTIVATIONS
 
 # What commands and folders of runs call it.
-STEERED = "steered"
+FINETUNED = "finetuned"
 # Classes whose actors can be taken over, by whether they squash their actions by tanh; sb3-contrib is an extra.
 SQUASHED = {"SAC": True, "TQC": True, "PPO": False, "A2C": False, "TRPO": False}
 
 
-class SteeredDTFM(DTFM):
+class FinetunedDTFM(DTFM):
     """
-    A DTFM whose noise an online algorithm has learned to choose, or whose actions it has learned to correct. It acts, is
+    A DTFM with a noise policy (noise-space RL) or a residual policy (residual RL) that an online algorithm has learned. It acts, is
     saved, loaded and exported as a DTFM is.
 
     Of noise `deterministic=True` takes what the algorithm's actor makes of the rows of the model's noise table, which is one
     draw of the actor's distribution that repeats exactly: at first this is what DTFM itself does, and it stays what the
-    algorithm learns from. The actor's mean would begin at zero noise, where arms get stuck. A correction is the actor's
+    algorithm learns from. The actor's mean would begin at zero noise, where arms get stuck. A residual action is the actor's
     mean, whatever `deterministic` is: at first nearly none.
 
-    Without a steering it is the DTFM. It does not learn from data; another steering is learned by
-    `SAC("MlpPolicy", NoiseActionVecEnv(venv, model))` or `PPO("MlpPolicy", CorrectionVecEnv(venv, model))`.
+    Without an online actor it is the DTFM. It does not learn from data; another actor is learned by
+    `SAC("MlpPolicy", NoiseActionVecEnv(venv, model))` or `PPO("MlpPolicy", ResidualActionVecEnv(venv, model))`.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.steering: dict[str, Any] | None = None
+        self.online_actor: dict[str, Any] | None = None
         super().__init__(*args, **kwargs)
 
     def _make_policy(self, ema: bool) -> SequencePolicy:
         policy = super()._make_policy(ema)
-        policy.set_steering(self.steering)
+        policy.set_online_actor(self.online_actor)
         return policy
 
     @classmethod
-    def of(cls, model: DTFM, agent: BaseAlgorithm | None = None) -> "SteeredDTFM":
+    def of(cls, model: DTFM, agent: BaseAlgorithm | None = None) -> "FinetunedDTFM":
         """
-        A copy of a model, that an agent steers.
+        A copy of a model, with an agent's actor.
 
         :param model: stays as it is
-        :param agent: see :meth:`steer`; None for no steering
+        :param agent: see :meth:`take_actor`; None for no actor
         :raises ValueError: an actor that cannot be taken over
         """
         file = io.BytesIO()
         model.save(file)
-        steered = cls.load(file, device=model.device)
-        steered.policy.optimizer.state.clear()  # it learns no more: half of the file
+        finetuned = cls.load(file, device=model.device)
+        finetuned.policy.optimizer.state.clear()  # it learns no more: half of the file
         if agent is not None:
-            steered.steer(agent)
-        return steered
+            finetuned.take_actor(agent)
+        return finetuned
 
-    def steer(self, agent: BaseAlgorithm) -> None:
+    def take_actor(self, agent: BaseAlgorithm) -> None:
         """
         Act by an agent's actor as it is now.
 
         :param agent: SAC, TQC, PPO, A2C or TRPO, whose "MlpPolicy" learns in a
-            :class:`~sb3_dtfm.finetuning.NoiseActionVecEnv` or a :class:`~sb3_dtfm.finetuning.CorrectionVecEnv`
-        :raises ValueError: another kind of actor, or corrections of single actions where several are carried out
+            :class:`~sb3_dtfm.finetuning.NoiseActionVecEnv` or a :class:`~sb3_dtfm.finetuning.ResidualActionVecEnv`
+        :raises ValueError: another kind of actor, or residual actions where several actions of a chunk are executed
         """
         settings, weights = _take_over(agent)
-        if settings["corrects"]:
-            self.policy.check_correctable(self.policy.n_action_steps)
-        if settings != self.steering or self.policy.steering is None:
-            self.policy.set_steering(settings)
-            self.steering = settings
-        assert self.policy.steering is not None
-        self.policy.steering.load_state_dict(weights)
+        if settings["residual"]:
+            self.policy.check_residual_actions(self.policy.n_action_steps)
+        if settings != self.online_actor or self.policy.online_actor is None:
+            self.policy.set_online_actor(settings)
+            self.online_actor = settings
+        assert self.policy.online_actor is not None
+        self.policy.online_actor.load_state_dict(weights)
 
     def learn(self, *args: Any, **kwargs: Any) -> NoReturn:
         """:raises ValueError: always"""
         raise ValueError(
-            "A steered model does not learn from data: it would no longer be what its steering was learned for."
+            "A fine-tuned model does not learn from data: its online actor was learned for the weights that it has."
         )
 
 
 def _take_over(agent: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
     """
-    An actor as settings and weights of :class:`~sb3_dtfm.policies.steering.Steering`.
+    An actor as settings and weights of :class:`~sb3_dtfm.policies.online_actor.OnlineActor`.
 
     :raises ValueError: one that has another form
     """
@@ -118,7 +118,7 @@ def _take_over(agent: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, th.Tenso
         "squashed": SQUASHED[name],
         "bound": env.bound,
         "hidden_state": env.hidden_state,
-        "corrects": isinstance(env, CorrectionVecEnv),
+        "residual": isinstance(env, ResidualActionVecEnv),
     }
     weights = {f"layers.{i}.0.{key}": value for i, each in enumerate(linear) for key, value in each.state_dict().items()}
     weights |= {f"mean.{key}": value for key, value in mean.state_dict().items()}
@@ -141,7 +141,7 @@ def _frozen_env(agent: BaseAlgorithm) -> FrozenPolicyVecEnv:
             _refuse(agent, "VecNormalize stands between its actor and observations that are normalised already")
         env = getattr(env, "venv", None)
     if env is None:
-        _refuse(agent, "it does not learn in a NoiseActionVecEnv or CorrectionVecEnv")
+        _refuse(agent, "it does not learn in a NoiseActionVecEnv or ResidualActionVecEnv")
     if agent.observation_space.shape != env.observation_space.shape:
         found = f"{agent.observation_space.shape}, and the {type(env).__name__} shows {env.observation_space.shape}"
         _refuse(agent, f"it sees observations of {found}")

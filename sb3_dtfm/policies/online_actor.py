@@ -1,7 +1,7 @@
 """
-Steering: what an online algorithm has learned to choose of how a flow acts.
+OnlineActor: what an online algorithm has learned to choose of how a flow acts.
 
-Its noise, in place of drawn noise (Wagenmaker et al., 2025), or corrections of its actions (Johannink et al., 2019).
+Its noise, in place of drawn noise (Wagenmaker et al., 2025), or residual actions (Johannink et al., 2019).
 """
 
 from collections.abc import Callable
@@ -25,15 +25,15 @@ ACCEPTED: dict[str, Rule] = {
     "squashed": BOOLEAN,
     "bound": POSITIVE,
     "hidden_state": BOOLEAN,
-    "corrects": BOOLEAN,
+    "residual": BOOLEAN,
 }
 
 
-def steering_observation(normalization: Normalization, newest: Windows, hidden: th.Tensor | None) -> th.Tensor:
+def actor_observation(normalization: Normalization, newest: Windows, hidden: th.Tensor | None) -> th.Tensor:
     """
-    What a steering chooses by: all that the frozen policy's newest step depends on, but for the steps before it.
+    The observation of an online actor: all that the frozen policy's newest step depends on, but for the steps before it.
 
-    Observations are in standard deviations of the training data, without what `calm_units` puts on top: the units that an
+    Observations are in standard deviations of the training data, without what `observation_scaling` puts on top: the units that an
     ordinary network learns from, as behind SB3's `VecNormalize`.
 
     :param normalization: of the policy
@@ -51,18 +51,18 @@ def steering_observation(normalization: Normalization, newest: Windows, hidden: 
     return th.cat(parts if hidden is None else [*parts, hidden], dim=1).clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP)
 
 
-class Steering(nn.Module):
+class OnlineActor(nn.Module):
     """
-    A Gaussian actor over noise, or over corrections, in a form that holds those of several algorithms.
+    A Gaussian actor over noise, or over residual actions, in a form that holds those of several algorithms.
 
     :param observation_dim: F, what it sees
     :param chosen_dim: what it chooses: N numbers of noise, or A of an action
     :param layers: widths of the hidden layers
     :param activation: a key of `ACTIVATIONS`
     :param squashed: it chooses bound * tanh(...), as SAC's and TQC's actions; otherwise clipped to the bound, as PPO's
-    :param bound: largest absolute noise, or correction of actions in [-1, 1]
+    :param bound: largest absolute noise, or residual action in units of [-1, 1]
     :param hidden_state: the trunk's hidden state is part of what it sees
-    :param corrects: it corrects actions, and sees them behind the rest; otherwise it chooses noise
+    :param residual: it residual actions, and sees them behind the rest; otherwise it chooses noise
     :raises ValueError: an argument out of range, by name
     """
 
@@ -76,7 +76,7 @@ class Steering(nn.Module):
         squashed: bool,
         bound: float,
         hidden_state: bool,
-        corrects: bool = False,
+        residual: bool = False,
     ) -> None:
         super().__init__()
         check_arguments(locals(), ACCEPTED)
@@ -85,7 +85,7 @@ class Steering(nn.Module):
         self.squashed = squashed
         self.bound = bound
         self.hidden_state = hidden_state
-        self.corrects = corrects
+        self.residual = residual
         self.chosen_dim = chosen_dim
         widths = [observation_dim, *layers]
         hidden = [nn.Sequential(nn.Linear(*pair), ACTIVATIONS[activation]()) for pair in zip(widths, layers, strict=False)]
@@ -105,30 +105,30 @@ class Steering(nn.Module):
 
     def act(self, observation: th.Tensor, drawn: th.Tensor, decode: Callable[[th.Tensor], th.Tensor]) -> th.Tensor:
         """
-        Noise is of the actor's distribution, a correction its mean, and of the first action alone: the rest are plans.
+        Noise is of the actor's distribution, a residual action its mean, and only the first action has one.
 
-        :param observation: (B, F), of :func:`steering_observation`
+        :param observation: (B, F), of :func:`actor_observation`
         :param drawn: noise (B, N), standard normal
         :param decode: from noise to actions (B, H A) in [-1, 1]
         :return: (B, H A) in [-1, 1]
         """
-        if not self.corrects:
+        if not self.residual:
             return decode(self(observation, drawn))
         actions = decode(drawn)
         own, plans = actions[:, : self.chosen_dim], actions[:, self.chosen_dim :]
-        correction = self(th.cat([observation, own], dim=1), th.zeros_like(own))
-        return th.cat([(own + correction).clamp(-1.0, 1.0), plans], dim=1)
+        residual = self(th.cat([observation, own], dim=1), th.zeros_like(own))
+        return th.cat([(own + residual).clamp(-1.0, 1.0), plans], dim=1)
 
 
-def make_steering(
+def make_online_actor(
     observation_dim: int, embed_dim: int, noise_dim: int, action_dim: int, settings: dict[str, Any]
-) -> Steering:
+) -> OnlineActor:
     """
     :param observation_dim: O, of the environment
     :param embed_dim: D, of the trunk
     :param noise_dim: N, of the head
     :param action_dim: A
-    :param settings: the keyword arguments of :class:`Steering`
+    :param settings: the keyword arguments of :class:`OnlineActor`
     :return: one whose weights are for the caller to load; PyTorch's global generator, which an algorithm may be learning by,
         is left as it is
     :raises ValueError: others than those, or one out of range
@@ -136,8 +136,8 @@ def make_steering(
     try:
         sees = observation_dim + 2 + (embed_dim if settings.get("hidden_state") else 0)
         with th.random.fork_rng(devices=[]):
-            if settings.get("corrects"):
-                return Steering(sees + action_dim, action_dim, **settings)
-            return Steering(sees, noise_dim, **settings)
+            if settings.get("residual"):
+                return OnlineActor(sees + action_dim, action_dim, **settings)
+            return OnlineActor(sees, noise_dim, **settings)
     except TypeError as error:
-        raise ValueError(f"No settings of a steering: {error}.") from error
+        raise ValueError(f"No settings of an online actor: {error}.") from error
