@@ -26,7 +26,7 @@ help:
 	@echo "make lowest   tests of each part with the lowest versions that pyproject.toml allows; make highest: the highest"
 	@echo "make audit    ask for known vulnerabilities of the pinned versions; needs the network"
 	@echo "make licences write the table of docs/licences.md anew"
-	@echo "make docs     the site, into build/site"
+	@echo "make docs     the report of results/suite.csv as docs/report.md, and the site, into build/site"
 	@echo "make dist     source distribution and wheel, into dist/; for PyPI with ADDRESS=https://github.com/OWNER/sb3_dtfm"
 	@echo "make format   rewrite the sources in the project's format"
 	@echo "make lint     check format and style"
@@ -109,6 +109,8 @@ licences: install $(TOOLS)/installed
 
 # Strict: a link or an anchor that leads nowhere is an error.
 docs: $(TOOLS)/installed linked
+	$(BIN)/sb3-dtfm report results/suite.csv -o build/report
+	cp build/report/report.md docs/
 	NO_MKDOCS_2_WARNING=1 $(TOOLS)/bin/mkdocs build --strict
 
 # The wheel is built from the source distribution, so that both are known to be whole.

@@ -2,10 +2,10 @@
 What fine-tuning brought: runs of `sb3-dtfm finetune` as rows, and their curves.
 
     python studies/finetuning.py measure logs/dtfm/robosuite-Can-v0_2 --before logs/dtfm/robosuite-Can-v0_1 \\
-        --like mine/robosuite-Can-v0_0.05_dtfm_seed0_small.jsonl --label own-episodes --output results/finetuning
-    python studies/finetuning.py plot results/finetuning --task HalfCheetah-v5 --labels steered sac sac-with-data \\
+        --like mine/robosuite-Can-v0_0.05_dtfm_seed0_small.jsonl --label own-episodes --output mine
+    python studies/finetuning.py plot results/finetuning.csv --task HalfCheetah-v5 --labels steered sac sac-with-data \\
         --output docs/studies/finetuning.png
-    python studies/finetuning.py attempts results/attempts --output docs/studies/attempts.png
+    python studies/finetuning.py attempts results/rollouts.csv --output docs/studies/attempts.png
 
 `measure` plays 100 final episodes, as `sb3-dtfm benchmark` does, with the model before (rows of the label "before"), with
 the last one after, and with the best of its evaluations (rows of the label with "-best"), and takes the curve from the run's

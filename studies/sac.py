@@ -2,7 +2,7 @@
 What fine-tuning stands beside: SAC from scratch, and SAC with the recorded episodes in its replay buffer from the start.
 
     OMP_NUM_THREADS=1 python studies/sac.py --like mine/robosuite-Can-v0_0.05_dtfm_seed0_small.jsonl -n 120000 \\
-        --eval-freq 30000 --output results/finetuning [--with-data]
+        --eval-freq 30000 --output mine [--with-data]
 
 `--like` is a cell of the model that is fine-tuned: its rows tell task, data and seed. Stable-Baselines3's SAC at its own
 settings, in ten environments, with a gradient step for each step of one. Evaluations are those of `sb3-dtfm benchmark`, and

@@ -1,7 +1,7 @@
 """
 What a study's runs had reached when those of another one, which need fewer minutes, were finished: same tasks, same data.
 
-    python studies/same_minutes.py results/one-token results/small --labels one-token ""
+    python studies/same_minutes.py results/one-token.csv results/small.csv --labels one-token ""
 
 A line for each task and algorithm: the means over the last three evaluations that were made within these minutes of
 training, seed by seed. The longer runs are cut short, so their learning rate had not come down yet. Other jobs can only make
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_dtfm.benchmark.report.runs import Run, read_studies
+from sb3_dtfm.benchmark.report.runs import Run, read_studies, row_value
 
 N_LAST = 3
 
@@ -32,9 +32,8 @@ def minutes_a_step(runs: list[Run]) -> float:
 def reached(run: Run, n_steps: float) -> str:
     """Return, or success in percent, after so many gradient steps."""
     rows = [row for row in run.evaluations if row["step"] <= n_steps][-N_LAST:]
-    if run.counts_success:
-        return f"{np.mean([row['successes'] for row in rows]):.0%}"
-    return f"{np.mean([row['returns'] for row in rows]):,.0f}"
+    mean = np.mean([row_value(row) for row in rows])
+    return f"{mean:.0f}%" if run.counts_success else f"{mean:,.0f}"
 
 
 def main() -> None:

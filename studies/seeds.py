@@ -1,8 +1,8 @@
 """
 The final evaluations of a study as a picture: a dot for each seed, their mean, and its 95 % interval (Student's t).
 
-    python studies/seeds.py results/adroit docs/studies/adroit.png --labels "" adroit
-    python studies/seeds.py results/chunks docs/studies/few.png --labels chunks --below demonstrations
+    python studies/seeds.py results/adroit.csv docs/studies/adroit.png --labels "" adroit
+    python studies/seeds.py results/chunks.csv docs/studies/few.png --labels chunks --below demonstrations
 """
 
 import argparse

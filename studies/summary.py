@@ -1,22 +1,20 @@
 """
-The rows of a study as a table: one line for each cell, a value for each seed, and the commits that they come from.
+The results of a study as a table: one line for each cell, a value for each seed, and the commits that they come from.
 
-    python studies/summary.py results/windows
-
-The tables of results/*/README.md are what this prints, and results/README.md says what the columns are.
+    python studies/summary.py results/windows.csv       # or a folder of rows
+    python studies/summary.py results/*.csv             # of several, what results/README.md says of each
 """
 
 import sys
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from sb3_dtfm.benchmark.report.runs import N_LATE, Run, read_studies, steps_to_success
+from sb3_dtfm.benchmark.report.runs import N_LATE, PAPER_ALGORITHMS, Run, read_studies, steps_to_success
 
 NONE = "-"
-HORIZON = 1000  # Steps of an episode of MuJoCo's tasks in which nobody falls.
-FIRST_STEPS = 100
 
 
 def measured(run: Run, measure: str) -> str:
@@ -31,8 +29,9 @@ def fallen(run: Run) -> str:
     """How many of the late and the final episodes ended early, and in brackets how many of them in their first steps."""
     if run.counts_success:
         return NONE
-    lengths = [length for row in [*run.evaluations[-N_LATE:], run.final] for length in row["lengths"]]
-    return f"{sum(n < HORIZON for n in lengths)} ({sum(n < FIRST_STEPS for n in lengths)})"
+    results = [*run.evaluations[-N_LATE:], run.final]
+    early, at_once = (sum(result[key] for result in results) for key in ("n_under_1000", "n_under_100"))
+    return f"{early} ({at_once})"
 
 
 def median_steps(run: Run) -> str:
@@ -47,9 +46,27 @@ def milliseconds(runs: Sequence[Run]) -> str:
     return f"{np.mean(told):.1f}" if told else NONE
 
 
-def lines(folder: Path) -> Iterable[dict[str, str]]:
+def about(path: Path) -> dict[str, str]:
+    """The line of a study in results/README.md."""
+    runs = [run for study in read_studies([path]) for group in study.groups for of in group.runs.values() for run in of]
+    algos = sorted({run.cell.algo for run in runs}, key=lambda algo: (algo not in PAPER_ALGORITHMS, algo))
+    seeds = sorted({run.cell.seed for run in runs})
+    commits = [commit for commit, _ in Counter(run.commit for run in runs).most_common()]
+    return {
+        "study": f"[{path.stem}]({path.name})",
+        "algorithms": _first([algo.upper() for algo in algos], 4),
+        "seeds": str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]}-{seeds[-1]}",
+        "commits": _first(commits, 2),
+    }
+
+
+def _first(names: Sequence[str], n: int) -> str:
+    return ", ".join(names) if len(names) <= n else f"{', '.join(names[:2])}, +{len(names) - 2}"
+
+
+def lines(path: Path) -> Iterable[dict[str, str]]:
     """One for each label, task, share of the data and algorithm."""
-    groups = [group for study in read_studies([folder]) for group in study.groups]
+    groups = [group for study in read_studies([path]) for group in study.groups]
     for group in sorted(groups, key=lambda group: group.label):
         for (task, share, algo), runs in sorted(group.runs.items()):
             values = {
@@ -71,10 +88,13 @@ def lines(folder: Path) -> Iterable[dict[str, str]]:
             }
 
 
-def table(folder: Path) -> str:
-    """Markdown, without the columns that say nothing of these rows."""
-    found = list(lines(folder))
-    header = [name for name in found[0] if any(line[name] != NONE for line in found)]
+def table(path: Path) -> str:
+    """Markdown, without the columns that say nothing of these results."""
+    found = list(lines(path))
+    return _markdown(found, [name for name in found[0] if any(line[name] != NONE for line in found)])
+
+
+def _markdown(found: Sequence[dict[str, str]], header: Sequence[str]) -> str:
     return "\n".join(
         f"| {' | '.join(line)} |"
         for line in [header, ["---"] * len(header), *([line[name] for name in header] for line in found)]
@@ -82,4 +102,5 @@ def table(folder: Path) -> str:
 
 
 if __name__ == "__main__":
-    print(table(Path(sys.argv[1])))
+    paths = [Path(argument) for argument in sys.argv[1:]]
+    print(table(*paths) if len(paths) == 1 else _markdown(each := [about(path) for path in paths], list(each[0])))

@@ -1,8 +1,7 @@
 """Rows of results: one line of JSON for each evaluation."""
 
 import json
-import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
@@ -129,7 +128,7 @@ def read_rows(path: Path, torn_end: bool = False) -> list[Row]:
                 break
             try:
                 if line.strip():
-                    rows.append(check_row(json.loads(line, parse_constant=_refuse)))
+                    rows.append(check_row(json.loads(line, parse_constant=refuse_constant)))
             except json.JSONDecodeError as error:
                 raise RowError(f"{path}, line {number}: is not JSON ({error.msg}); expected one object a line.") from error
             except RowError as error:
@@ -137,45 +136,11 @@ def read_rows(path: Path, torn_end: bool = False) -> list[Row]:
     return rows
 
 
-def _refuse(constant: str) -> NoReturn:
+def refuse_constant(constant: str) -> NoReturn:
     """
     :raises RowError: Python reads NaN and infinity, but JSON has neither
     """
     raise RowError(f"holds {constant}, expected numbers.")
-
-
-def result_files(paths: Iterable[str | os.PathLike[str]]) -> dict[str, list[Path]]:
-    """
-    Files of rows by study: a folder below one that is named is a study, what was named itself is the study "".
-
-    :param paths: files, and folders with `*.jsonl` in them or below them
-    :raises FileNotFoundError: one of them does not exist
-    """
-    studies: dict[str, list[Path]] = {}
-    for path in map(Path, paths):
-        if not path.exists():
-            raise FileNotFoundError(f"{path} does not exist; expected a folder or a file that `sb3-dtfm benchmark` wrote.")
-        for file in sorted(path.rglob("*.jsonl")) if path.is_dir() else [path]:
-            study = file.parent.relative_to(path).as_posix() if path.is_dir() else "."
-            studies.setdefault("" if study == "." else study, []).append(file)
-    return studies
-
-
-def merge_rows(files: Sequence[Path]) -> list[Row]:
-    """
-    The rows of several files. A row that is there twice, as after copying files together, counts once.
-
-    :raises RowError: a malformed row, or two different results of the same evaluation
-    """
-    rows: dict[tuple[Any, ...], tuple[Row, Path]] = {}
-    for path in files:
-        for row in read_rows(path):
-            key = (Cell.of(row), row["step"], row["final"])
-            known, where = rows.setdefault(key, (row, path))
-            if known != row:
-                what = f"different results of {key[0]}, step {key[1]}; keep one run of it, or give it a label."
-                raise RowError(f"{where} and {path}: {what}")
-    return [row for row, _ in rows.values()]
 
 
 def finished_cells(rows: Iterable[Row]) -> dict[Cell, int]:

@@ -1,4 +1,4 @@
-"""`sb3-dtfm report`: tables and figures from rows of results."""
+"""`sb3-dtfm report`: tables and figures from results, and results as a CSV table."""
 
 import argparse
 from collections.abc import Sequence
@@ -8,6 +8,7 @@ from sb3_dtfm.benchmark.report.changes import split_changes
 from sb3_dtfm.benchmark.report.figures import check_baselines, plot_group, plot_scores, plot_solved, read_baseline
 from sb3_dtfm.benchmark.report.runs import Group, Study, read_studies
 from sb3_dtfm.benchmark.report.tables import make_report
+from sb3_dtfm.benchmark.results import read_results, write_results
 from sb3_dtfm.benchmark.rows import plain_name
 
 # From so many on a grid with a row of learning curves for each is too long to be drawn.
@@ -24,12 +25,12 @@ def main(argv: Sequence[str]) -> None:
     """
     parser = argparse.ArgumentParser(
         prog="sb3-dtfm report",
-        description="Write report.md and figures from rows of `sb3-dtfm benchmark`.",
-        epilog="Folders below those named are studies: each has its own part of the report. Rows of folders and files that "
-        "are named themselves are put together. Settings that a label changed are compared with runs without it, of the "
-        "same study if it has some.",
+        description="Write report.md and figures from rows of `sb3-dtfm benchmark`, or from CSV tables of them.",
+        epilog="Tables in the folders that are named, and folders below these, are studies: each has its own part of the "
+        "report. Results of folders and files that are named themselves are put together. Settings that a label changed are "
+        "compared with runs without it, of the same study if it has some.",
     )
-    parser.add_argument("results", nargs="+", help="folders or files of rows")
+    parser.add_argument("results", nargs="+", help="CSV tables, files of rows, or folders of either")
     argument = parser.add_argument
     argument("-o", "--output", default="docs", metavar="DIR", help="where report.md and the PNGs go; docs by default")
     argument(
@@ -38,7 +39,11 @@ def main(argv: Sequence[str]) -> None:
     baseline = "curve of an SB3 run: its evaluations.npz"
     argument("--baseline", action="append", default=[], metavar="[TASK:]NAME=FILE", help=baseline)
     argument("--no-agent-line", action="store_true", help="do not draw what the recorded episodes reached")
+    argument("--csv", metavar="FILE", help="write one table of all evaluations, a line for each, and no report")
     options = parser.parse_args(argv)
+    if options.csv:
+        write_csv(options.results, Path(options.csv))
+        return
     studies = read_studies(options.results, options.tasks)
     if not any(study.groups for study in studies):
         raise ValueError(f"{', '.join(options.results)}: no finished cell; `sb3-dtfm benchmark` writes some.")
@@ -68,6 +73,20 @@ def main(argv: Sequence[str]) -> None:
     report = output / "report.md"
     report.write_text(make_report(studies, figures))
     print(report)
+
+
+def write_csv(paths: Sequence[str], output: Path) -> None:
+    """
+    Write the results of one study as a table.
+
+    :raises ValueError: there are several, or none
+    """
+    studies = read_results(paths)
+    if len(studies) != 1:
+        found = f"the studies {', '.join(sorted(studies))}" if studies else "no rows"
+        raise ValueError(f"--csv {output}: {', '.join(paths)} holds {found}; name the folder of one.")
+    write_results(output, *studies.values())
+    print(output)
 
 
 def figure_name(kind: str, study: Study, group: Group) -> str:

@@ -1,7 +1,7 @@
 """
 The rows of `make peers` as a picture: each algorithm's mean, as a share of the best one's on the same data.
 
-    PYTHONPATH=studies python -m peers.figure results/peers docs/studies/peers.png
+    PYTHONPATH=studies python -m peers.figure results/baselines.csv docs/studies/peers.png
 """
 
 import argparse

@@ -1,9 +1,9 @@
 """
 The rows of `make peers` as a table: success in percent or return, mean over seeds and its 95 % interval (Student's t).
 
-    PYTHONPATH=studies python -m peers.table results/peers           # a line for each dataset and algorithm
-    PYTHONPATH=studies python -m peers.table results/peers --short   # a line for each dataset
-    PYTHONPATH=studies python -m peers.table results/peers --suite results/suite   # and ours by the classes' defaults
+    PYTHONPATH=studies python -m peers.table results/baselines.csv           # a line for each dataset and algorithm
+    PYTHONPATH=studies python -m peers.table results/baselines.csv --short   # a line for each dataset
+    PYTHONPATH=studies python -m peers.table results/baselines.csv --suite results/suite.csv   # and our defaults
 """
 
 import argparse

@@ -1,19 +1,15 @@
-"""What docs/ and README say of the committed rows is what the report makes of them."""
+"""What README says of the committed results is what the report makes of them."""
 
+from collections import defaultdict
 from pathlib import Path
-
-import pytest
 
 from sb3_dtfm.benchmark import grid
 from sb3_dtfm.benchmark.grid import read_tasks
+from sb3_dtfm.benchmark.report.runs import read_studies
+from sb3_dtfm.benchmark.report.tables import make_report
 from sb3_dtfm.cli.benchmark import parse_arguments
-from sb3_dtfm.cli.main import main
 
 ROOT = Path(__file__).parents[2]
-# Where a report lies, and of what it is; results/README.md has the commands.
-STUDIES = ("time-steps", "windows/*_uniform-windows.jsonl", "paused", "mixed", "few", "noisy", "two-ways", "styles")
-REPORTS = {"docs": ("suite",), "docs/studies": STUDIES}
-
 # README's name of a data set of the suite, and the report's.
 IN_README = {
     "Hopper, one agent *": "hopper*",
@@ -36,17 +32,9 @@ def test_the_suite_of_data_sets_is_what_the_benchmark_reads(monkeypatch):
     assert 0 < sum(task.chosen_with for task in tasks) < len(tasks) / 2
 
 
-@pytest.mark.parametrize("docs", REPORTS)
-def test_a_report_shows_the_committed_rows(docs, tmp_path):
-    results = [str(path) for pattern in REPORTS[docs] for path in sorted((ROOT / "results").glob(pattern))]
-    assert main(["report", *results, "-o", str(tmp_path)]) == 0
-    assert (ROOT / docs / "report.md").read_text() == (tmp_path / "report.md").read_text()
-    for figure in tmp_path.glob("*.png"):
-        assert (ROOT / docs / figure.name).is_file()
-
-
 def test_readme_says_what_the_report_says():
-    report, readme = (ROOT / "docs" / "report.md").read_text(), (ROOT / "README.md").read_text().splitlines()
+    studies = read_studies([ROOT / "results" / "suite.csv"])
+    report, readme = make_report(studies, defaultdict(dict)), (ROOT / "README.md").read_text().splitlines()
     for name, data_set in IN_README.items():
         (line,) = (each for each in readme if each.startswith(f"| {name} |"))
         assert f"\n{line.replace(name, data_set).removesuffix(' |')} | " in report, name

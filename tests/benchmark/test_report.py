@@ -21,6 +21,7 @@ from sb3_dtfm.benchmark.report.runs import (
     spread,
     steps_to_success,
 )
+from sb3_dtfm.benchmark.results import summarize
 from sb3_dtfm.benchmark.rows import Cell, Row, write_row
 from sb3_dtfm.cli.main import main
 from tests.benchmark.conftest import make_row
@@ -59,7 +60,7 @@ def test_late_best_and_final_are_those_of_each_run(groups):
 
 def test_an_evaluation_before_training_is_drawn_and_counts_for_no_measure(groups):
     run = groups["small"].of(LIFT, 1.0, "dt")[0]
-    untrained = {**run.evaluations[-1], "step": 0, "successes": [True] * 4, "returns": [1.0] * 4}
+    untrained = {**run.evaluations[-1], "step": 0, "successes": 4, "mean_return": 1.0}
     for rows in (run.evaluations, run.evaluations[-2:], []):
         before = run._replace(evaluations=rows)
         (group,), _ = group_runs([untrained, *rows, run.final])
@@ -83,8 +84,20 @@ def test_the_curve_is_the_mean_over_seeds_with_a_pooled_band(groups):
 
 def with_returns(run, *returns: list[float]):
     """The run with these returns at its evaluations, of a task without success."""
-    rows = [{**row, "returns": values, "successes": None} for row, values in zip(run.evaluations, returns, strict=False)]
-    return run._replace(evaluations=rows, final={**run.final, "successes": None})
+    results = [
+        summarize(
+            make_row(
+                step=result["step"],
+                wall_s=result["wall_s"],
+                final=False,
+                returns=values,
+                lengths=[1] * len(values),
+                successes=None,
+            )
+        )
+        for result, values in zip(run.evaluations, returns, strict=False)
+    ]
+    return run._replace(evaluations=results, final={**run.final, "successes": None})
 
 
 def test_the_band_of_returns_is_over_the_episodes_of_one_seed_and_the_range_of_several(groups):
@@ -146,7 +159,9 @@ def test_curves_by_minutes_have_each_seeds_own_clock_and_a_line_at_the_threshold
 def test_minutes_to_the_threshold_are_those_of_the_first_evaluation_there(groups):
     run = groups["small"].of(LIFT, 1.0, "dt")[0]
     assert run.minutes_to_threshold == math.inf
-    assert run._replace(final={**run.final, "successes": [True] * 20, "wall_s": 90.0}).minutes_to_threshold == 1.5
+    assert (
+        run._replace(final={**run.final, "successes": run.final["n_episodes"], "wall_s": 90.0}).minutes_to_threshold == 1.5
+    )
     # 1 of return was recorded: the mean is below 0.95, at it, above, below
     returns = with_returns(run, [1.0, 0.8], [1.0, 0.9], [2.0, 2.0], [0.0, 0.0])
     assert returns.minutes_to_threshold == pytest.approx(40 / 60)
@@ -158,7 +173,7 @@ def test_the_interval_of_success_is_the_wider_one_of_seeds_and_episodes():
     def run(seed: int, n_successes: int) -> Run:
         successes = [i < n_successes for i in range(10)]
         row = make_row(seed=seed, returns=[0.0] * 10, lengths=[1] * 10, successes=successes)
-        return Run(Cell.of(row), [], row)
+        return Run(Cell.of(row), [], summarize(row))
 
     apart, alike = ([run(seed, n) for seed, n in enumerate(each)] for each in ((2, 9), (5, 5)))
     assert final_interval(apart) == pytest.approx((55.0, 0.0, 100.0))  # Student's t: 55 +- 445
@@ -168,7 +183,7 @@ def test_the_interval_of_success_is_the_wider_one_of_seeds_and_episodes():
 
 def test_steps_to_success_are_those_of_all_seeds_and_failures_take_for_ever(groups):
     run = groups["small"].of(LIFT, 1.0, "dt")[0]
-    other = run._replace(final={**run.final, "lengths": [30, 50], "successes": [True, True]})
+    other = run._replace(final={**run.final, "steps_to_success": [30, 50], "n_episodes": 2})
     assert steps_to_success([run, other]).tolist() == [30, 40, 40, 40, 50, math.inf]
 
 
@@ -295,7 +310,7 @@ def write_suite(folder: Path, rows: Sequence[Row]) -> None:
 
 
 def test_a_score_goes_from_random_actions_to_the_best_tenth_of_what_was_recorded():
-    (group,), _ = group_runs(SUITE)
+    (group,), _ = group_runs(map(summarize, SUITE))
     scores = {(run.cell.task, run.cell.algo, run.cell.seed): run.score("final") for of in group.runs.values() for run in of}
     # From -300 to 100; of four episodes one and two succeed, and half of the best tenth did
     assert scores == {
@@ -307,7 +322,7 @@ def test_a_score_goes_from_random_actions_to_the_best_tenth_of_what_was_recorded
         ("lift-10", "bc", 0): 0.5,
         ("lift-10", "dtfm", 0): 1.0,
     }
-    (worse,) = group_runs([cloned("hopper", "bc", 0, 5.0, random_return=200.0)])[0][0].of("hopper", 1.0, "bc")
+    (worse,) = group_runs([summarize(cloned("hopper", "bc", 0, 5.0, random_return=200.0))])[0][0].of("hopper", 1.0, "bc")
     assert worse.score("final") is None, "random actions are no worse than the recordings"
 
 

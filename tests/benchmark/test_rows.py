@@ -1,10 +1,10 @@
-"""Rows: there and back, merged, and refused with file and line."""
+"""Rows: there and back, and refused with file and line."""
 
 import json
 
 import pytest
 
-from sb3_dtfm.benchmark.rows import KEYS, Cell, RowError, finished_cells, merge_rows, read_rows, result_files, write_row
+from sb3_dtfm.benchmark.rows import KEYS, Cell, RowError, read_rows, write_row
 from tests.benchmark.conftest import make_row
 
 
@@ -24,37 +24,6 @@ def test_what_a_kill_has_left_of_a_last_line_is_left_out_where_that_is_known(tmp
     assert read_rows(tmp_path / "a.jsonl", torn_end=True) == [row]
     with pytest.raises(RowError, match="line 2: is not JSON"):
         read_rows(tmp_path / "a.jsonl")
-
-
-def test_files_of_several_machines_merge_by_concatenation(tmp_path):
-    rows = [make_row(seed=seed) for seed in range(3)]
-    write_row(tmp_path / "a.jsonl", rows[0])
-    write_row(tmp_path / "b.jsonl", rows[1])
-    write_row(tmp_path / "b.jsonl", rows[2])
-    files = result_files([tmp_path])[""]
-    (tmp_path / "all.jsonl").write_text("".join(file.read_text() for file in files))
-    assert merge_rows(files) == rows
-    assert merge_rows(result_files([tmp_path])[""]) == rows, "a row that is there twice counts once"
-    assert finished_cells(rows) == {Cell.of(row): 10 for row in rows}
-
-
-def test_a_folder_below_the_one_that_is_named_is_a_study(tmp_path):
-    for name in ("a.jsonl", "small/b.jsonl", "few/c.jsonl", "few/d.jsonl", "few/notes.txt"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).touch()
-    names = {study: [file.name for file in files] for study, files in result_files([tmp_path]).items()}
-    assert names == {"": ["a.jsonl"], "few": ["c.jsonl", "d.jsonl"], "small": ["b.jsonl"]}
-    both = result_files([tmp_path / "small", tmp_path / "few", tmp_path / "a.jsonl"])
-    assert [file.name for file in both[""]] == ["b.jsonl", "c.jsonl", "d.jsonl", "a.jsonl"]
-    with pytest.raises(FileNotFoundError, match="nowhere does not exist; expected a folder or a file"):
-        result_files([tmp_path / "nowhere"])
-
-
-def test_two_results_of_one_evaluation_are_refused(tmp_path):
-    write_row(tmp_path / "a.jsonl", make_row())
-    write_row(tmp_path / "b.jsonl", make_row(returns=[0.0, 0.0, 0.0, 0.0]))
-    with pytest.raises(RowError, match=r"a\.jsonl and .*b\.jsonl: different results of robosuite/Lift-v0"):
-        merge_rows(result_files([tmp_path])[""])
 
 
 @pytest.mark.parametrize(

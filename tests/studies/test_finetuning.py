@@ -1,7 +1,6 @@
 """What fine-tuning brought is measured and shown."""
 
 import shutil
-from pathlib import Path
 
 import finetuning
 import numpy as np
@@ -10,9 +9,8 @@ import pytest
 from sb3_dtfm.benchmark.report.runs import read_studies
 from sb3_dtfm.benchmark.rows import Cell, read_rows, write_row
 from sb3_dtfm.cli.main import main
+from tests.benchmark.conftest import make_row
 from tests.recorded import DATASET_ID, tiny_training
-
-ROOT = Path(__file__).parents[2]
 
 
 def test_a_run_is_measured_and_shown(workplace):
@@ -32,16 +30,16 @@ def test_a_run_is_measured_and_shown(workplace):
     runs = {group.label: next(iter(group.runs.values()))[0] for group in study.groups}
     before, after, best = (runs[label] for label in ("before", "own", "own-best"))
     assert [row["step"] for row in after.evaluations] == [0, 40, 80]
-    assert [len(row["returns"]) for row in after.evaluations] == [3, 3, 3]
+    assert [result["n_episodes"] for result in after.evaluations] == [3, 3, 3]
     assert not before.evaluations
     assert not best.evaluations
-    assert best.final["returns"] == before.final["returns"]
+    assert best.final["mean_return"] == before.final["mean_return"]
     with np.load(run / "evaluations.npz") as evaluations:
         means = evaluations["results"].mean(axis=1)
         assert best.final["step"] == evaluations["timesteps"][means.argmax()]
-    assert before.final["lengths"] == after.final["lengths"] == [22] * 100  # as in evaluations, longer than attempts
+    assert before.final["mean_length"] == after.final["mean_length"] == 22  # as in evaluations, longer than attempts
     assert after.final["settings"]["env_kwargs"] == {"max_episode_steps": 20}
-    assert before.final["returns"] != after.final["returns"]
+    assert before.final["mean_return"] != after.final["mean_return"]
     assert after.final["settings"]["gradient_steps"] == 2
     assert after.final["settings"]["policy_kwargs"]["embed_dim"] == 16  # of the model before
     rows = read_rows(workplace / "rows" / f"{cell._replace(label='own').file_name}.jsonl")
@@ -81,7 +79,7 @@ def test_a_noise_space_run_is_measured_where_its_decisions_are_steps(workplace):
 
 
 def test_attempts_are_shown_by_the_steps_they_took(tmp_path, monkeypatch):
-    like = read_rows(next((ROOT / "results" / "attempts").glob("*.jsonl")))[-1]
+    like = make_row()
     lift = {("Lift", 0, "many", 50): 2, ("Lift", 1, "many", 54): 4, ("Lift", 0, "none", 10): 1, ("Lift", 1, "none", 10): 0}
     can = {("Can", 0, "none", 10): 3, ("Can", 1, "none", 10): 1, ("Can", 0, "many", 30): 3, ("Can", 1, "many", 30): 4}
     for (task, seed, label, n_steps), n in {**lift, **can}.items():

@@ -329,15 +329,15 @@ def test_the_picture_shows_all_rows(tmp_path, monkeypatch):
     drawn = []
     plot = Axes.plot
     monkeypatch.setattr(Axes, "plot", lambda self, x, y, *a, **k: drawn.extend(x) or plot(self, x, y, *a, **k))
-    figure.plot(ROOT / "results" / "peers", tmp_path / "peers.png")
+    figure.plot(ROOT / "results" / "baselines.csv", tmp_path / "peers.png")
     assert (tmp_path / "peers.png").stat().st_size > 10_000
-    assert len(drawn) == len(list(table.long_table(ROOT / "results" / "peers"))) - 1  # but for the header
+    assert len(drawn) == len(list(table.long_table(ROOT / "results" / "baselines.csv"))) - 1  # but for the header
     assert min(drawn) >= 0
     assert max(drawn) == 1
 
 
 def test_the_page_says_what_the_rows_say():
-    header, *lines = table.long_table(ROOT / "results" / "peers")
+    header, *lines = table.long_table(ROOT / "results" / "baselines.csv")
     shown = [dict(zip(header, line, strict=True)) for line in lines]
     columns = ("data", "algorithm", "final", "minutes", "gradient steps", "ms an action")
     page = (ROOT / "docs" / "studies" / "peers.md").read_text()
@@ -345,7 +345,7 @@ def test_the_page_says_what_the_rows_say():
 
 
 def test_the_page_shows_the_defaults_beside_the_other_libraries():
-    header, *lines = table.suite_table(ROOT / "results" / "peers", ROOT / "results" / "suite")
+    header, *lines = table.suite_table(ROOT / "results" / "baselines.csv", ROOT / "results" / "suite.csv")
     page = (ROOT / "docs" / "studies" / "peers.md").read_text()
     assert len(lines) >= 8
     for line in (header, *lines):

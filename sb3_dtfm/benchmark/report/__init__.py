@@ -1,1 +1,1 @@
-"""What rows of results say: statistics, tables and figures. Nothing here needs a simulator, or what made the rows."""
+"""What results say: statistics, tables and figures. Nothing here needs a simulator, or what made the rows."""

@@ -141,7 +141,7 @@ def plot_solved(group: Group, output: Path) -> Path | None:
                         steps = steps_to_success(runs)
                         share = 100.0 * np.arange(1, len(steps) + 1) / len(steps)
                         solved = np.isfinite(steps)
-                        longest = max(max(run.final["lengths"]) for run in runs)
+                        longest = max(run.final["max_length"] for run in runs)
                         x = np.concatenate(([0.0], steps[solved], [longest]))
                         y = np.concatenate(([0.0], share[solved], [100.0 * solved.mean()]))
                         axis.step(x, y, where="post", color=color, linewidth=1.8, label=algo.upper())

@@ -1,4 +1,4 @@
-"""From rows to runs: what each training run achieved, and how runs of a cell are summed up."""
+"""From results to runs: what each training run achieved, and how runs of a cell are summed up."""
 
 import math
 import os
@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_dtfm.benchmark.report.statistics import Interval, mean_and_deviation, student_t, wilson
-from sb3_dtfm.benchmark.rows import BASELINES, Cell, Row, merge_rows, result_files
+from sb3_dtfm.benchmark.report.statistics import Interval, mean_and_deviation, student_t, t_interval, wilson
+from sb3_dtfm.benchmark.results import Result, read_results
+from sb3_dtfm.benchmark.rows import BASELINES, Cell
 
 # The paper's comparison, which is shown whether it was run or not.
 PAPER_ALGORITHMS = ("dt", "dtfm")
@@ -25,13 +26,13 @@ class Run(NamedTuple):
     One training run.
 
     :param cell: what it is known by
-    :param evaluations: rows of the evaluations before and during training, by gradient step
-    :param final: row of the final evaluation
+    :param evaluations: results of the evaluations before and during training, by gradient step
+    :param final: result of the final evaluation
     """
 
     cell: Cell
-    evaluations: list[Row]
-    final: Row
+    evaluations: list[Result]
+    final: Result
 
     @property
     def counts_success(self) -> bool:
@@ -220,9 +221,9 @@ class Group(NamedTuple):
 
 class Study(NamedTuple):
     """
-    What one folder of results holds.
+    What one folder or table of results holds.
 
-    :param name: of the folder, "" for what was named itself
+    :param name: of the folder or table, "" for what was named itself
     :param groups: its runs by profile and label
     :param unfinished: cells left out because they have no final evaluation
     """
@@ -234,14 +235,14 @@ class Study(NamedTuple):
 
 def read_studies(paths: Iterable[str | os.PathLike[str]], tasks: Sequence[str] = ()) -> list[Study]:
     """
-    The studies in files and folders of rows; those with runs of a profile as it is come first.
+    The studies in tables, and in files and folders of rows; those with runs of a profile as it is come first.
 
-    :param paths: see :func:`~sb3_dtfm.benchmark.rows.result_files`
+    :param paths: see :func:`~sb3_dtfm.benchmark.results.read_results`
     :param tasks: see :func:`group_runs`
     :raises FileNotFoundError: one of them does not exist
-    :raises RowError: a malformed row, or two different results of the same evaluation in one study
+    :raises RowError: a malformed line, or two different results of the same evaluation in one study
     """
-    studies = [Study(name, *group_runs(merge_rows(files), tasks)) for name, files in result_files(paths).items()]
+    studies = [Study(name, *group_runs(results, tasks)) for name, results in read_results(paths).items()]
     return sorted(studies, key=lambda study: (all(group.label for group in study.groups), study.name))
 
 
@@ -250,27 +251,28 @@ def full_name(algo: str) -> str:
     return {"bc-best": "BC of the best tenth"}.get(algo, algo.upper())
 
 
-def row_value(row: Row) -> float:
+def row_value(result: Result) -> float:
     """Success in percent where the task reports it, else the mean return."""
-    return 100.0 * float(np.mean(row["successes"])) if row["successes"] is not None else float(np.mean(row["returns"]))
+    successes: int | None = result["successes"]
+    return float(result["mean_return"]) if successes is None else 100.0 * (successes / result["n_episodes"])
 
 
-def group_runs(rows: Iterable[Row], tasks: Sequence[str] = ()) -> tuple[list[Group], list[Cell]]:
+def group_runs(results: Iterable[Result], tasks: Sequence[str] = ()) -> tuple[list[Group], list[Cell]]:
     """
     Runs by profile and label.
 
-    :param rows: in any order
+    :param results: in any order
     :param tasks: shown first and in this order; run or not, where there is no label
     :return: the groups, and cells left out because they have no final evaluation
     """
-    evaluations: dict[Cell, list[Row]] = {}
-    finals: dict[Cell, Row] = {}
-    for row in sorted(rows, key=lambda row: int(row["step"])):
-        during = evaluations.setdefault(Cell.of(row), [])
-        if row["final"]:
-            finals[Cell.of(row)] = row
+    evaluations: dict[Cell, list[Result]] = {}
+    finals: dict[Cell, Result] = {}
+    for result in sorted(results, key=lambda result: int(result["step"])):
+        during = evaluations.setdefault(Cell.of(result), [])
+        if result["final"]:
+            finals[Cell.of(result)] = result
         else:
-            during.append(row)
+            during.append(result)
     groups: dict[tuple[str, str], Group] = {}
     for cell in sorted(finals):
         group = groups.setdefault((cell.profile, cell.label), Group(cell.profile, cell.label, [], {}))
@@ -322,19 +324,16 @@ def late_interval(runs: Sequence[Run]) -> Interval | None:
     return Interval(*np.clip(interval, 0.0, 100.0).tolist()) if runs[0].counts_success else interval
 
 
-def _pooled_success(rows: Sequence[Row]) -> Interval:
-    successes = np.concatenate([row["successes"] for row in rows])
-    return Interval(*(100.0 * limit for limit in wilson(int(successes.sum()), len(successes))))
+def _pooled_success(results: Sequence[Result]) -> Interval:
+    counts = (sum(result[key] for result in results) for key in ("successes", "n_episodes"))
+    return Interval(*(100.0 * limit for limit in wilson(*counts)))
 
 
 def steps_to_success(runs: Sequence[Run]) -> np.ndarray:
     """Environment steps that each final episode of all runs took to succeed, ascending; inf for those that failed."""
-    steps = [
-        length if success else np.inf
-        for run in runs
-        for length, success in zip(run.final["lengths"], run.final["successes"], strict=True)
-    ]
-    return np.sort(np.array(steps, float))
+    solved = [step for run in runs for step in run.final["steps_to_success"]]
+    n_failed = sum(run.final["n_episodes"] for run in runs) - len(solved)
+    return np.array(sorted(solved) + [np.inf] * n_failed, float)
 
 
 def learning_curve(runs: Sequence[Run]) -> Curve:
@@ -356,7 +355,7 @@ def learning_curve(runs: Sequence[Run]) -> Curve:
         elif runs[0].counts_success:
             interval = _pooled_success(rows)
         else:
-            interval = student_t(rows[0]["returns"])
+            interval = t_interval(*(rows[0][key] for key in ("mean_return", "std_return", "n_episodes")))
         seconds = np.mean([row["wall_s"] for row in rows])
         points.append((seconds / 60, np.mean(values), interval.low, interval.high))
     minutes, mean, low, high = np.array(points, float).reshape(-1, 4).T

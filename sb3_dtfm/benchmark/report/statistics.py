@@ -38,10 +38,14 @@ def wilson(n_successes: int, n_episodes: int) -> Interval:
 
 def student_t(values: Sequence[float] | np.ndarray) -> Interval:
     """Mean with Student's t interval; values that do not spread, as a single one, have no interval."""
-    mean, deviation = mean_and_deviation(values)
-    if not deviation > 0:
+    return t_interval(*mean_and_deviation(values), len(values))
+
+
+def t_interval(mean: float, deviation: float | None, n: int) -> Interval:
+    """The same of values of this mean and sample standard deviation, of which a single value has none."""
+    if not deviation or not deviation > 0:
         return Interval(mean)
-    half = stats.t.ppf(0.5 + CONFIDENCE / 2, len(values) - 1) * deviation / math.sqrt(len(values))
+    half = stats.t.ppf(0.5 + CONFIDENCE / 2, n - 1) * deviation / math.sqrt(n)
     return Interval(mean, mean - float(half), mean + float(half))
 
 

@@ -209,7 +209,7 @@ def _final(runs: Sequence[Run]) -> str:
     interval = final_interval(runs)
     if not runs[0].counts_success:
         return _over_seeds(interval, runs)
-    return f"{_bracket(interval, _percent)} % of {sum(len(run.final['returns']) for run in runs)} episodes"
+    return f"{_bracket(interval, _percent)} % of {sum(run.final['n_episodes'] for run in runs)} episodes"
 
 
 def _over_seeds(interval: Interval, runs: Sequence[Run]) -> str:
