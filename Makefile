@@ -1,11 +1,11 @@
 .DELETE_ON_ERROR:
-.PHONY: help install demo test test-all bench peers lowest highest audit licences docs dist format lint type linked clean
+.PHONY: help install demo test test-all bench baselines lowest highest audit licences docs dist format lint type linked clean
 
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 # d3rlpy needs another gymnasium, robomimic a torchvision.
-PEERS := .venv-peers
+OTHERS := .venv-baselines
 ROBOMIMIC := .venv-robomimic
 # What looks at dependencies, makes the site and looks at what is published, apart from them.
 TOOLS := .venv-tools
@@ -21,7 +21,7 @@ help:
 	@echo "make test     the fast tests"
 	@echo "make test-all the slow tests too: kills, a million calls, several processes; half an hour on 2 cores"
 	@echo "make bench    DT and DTFM beside d3rlpy, training and acting: 15 minutes on 2 idle cores"
-	@echo "make peers    DT and DTFM beside d3rlpy's and robomimic's algorithms on studies/peers.yml: days on one core;"
+	@echo "make baselines    DT and DTFM beside d3rlpy's and robomimic's algorithms on studies/baselines.yml: days on one core;"
 	@echo "              ARGUMENTS=\"--data can-few --seeds 0\" runs some of it, ARGUMENTS=--help says what there is"
 	@echo "make lowest   tests of each part with the lowest versions that pyproject.toml allows; make highest: the highest"
 	@echo "make audit    ask for known vulnerabilities of the pinned versions; needs the network"
@@ -68,17 +68,17 @@ test: install
 test-all: install
 	$(BIN)/python -m pytest -n 2 --maxschedchunk 1 --durations=20 -m "slow or not slow"
 
-bench: install $(PEERS)/installed
-	$(BIN)/python studies/compare.py --peer-python $(PEERS)/bin/python
+bench: install $(OTHERS)/installed
+	$(BIN)/python studies/compare.py --baseline-python $(OTHERS)/bin/python
 
-$(PEERS)/installed: constraints.txt
-	rm -rf $(PEERS)
-	$(BIN)/python -m venv $(PEERS)
-	$(PEERS)/bin/pip install --disable-pip-version-check --quiet $$(grep '^torch==' constraints.txt) d3rlpy==2.8.1
+$(OTHERS)/installed: constraints.txt
+	rm -rf $(OTHERS)
+	$(BIN)/python -m venv $(OTHERS)
+	$(OTHERS)/bin/pip install --disable-pip-version-check --quiet $$(grep '^torch==' constraints.txt) d3rlpy==2.8.1
 	@touch $@
 
-peers: install $(PEERS)/installed $(ROBOMIMIC)/installed
-	PYTHONPATH=studies $(BIN)/python -m peers $(ARGUMENTS)
+baselines: install $(OTHERS)/installed $(ROBOMIMIC)/installed
+	PYTHONPATH=studies $(BIN)/python -m baselines $(ARGUMENTS)
 
 # What of robomimic learns from vectors needs no more than this; with its own requirements pip would take another torch.
 $(ROBOMIMIC)/installed: constraints.txt
@@ -147,4 +147,4 @@ linked:
 	@ln -s $(CURDIR)/envs $(CURDIR)/zoo_configs build/linked/sb3_dtfm/
 
 clean:
-	rm -rf $(VENV) $(PEERS) $(ROBOMIMIC) $(TOOLS) .venv-lowest .venv-highest build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(OTHERS) $(ROBOMIMIC) $(TOOLS) .venv-lowest .venv-highest build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -1,8 +1,8 @@
 """
-DT and DTFM beside their peer d3rlpy, in turn on one machine: `make bench`.
+DT and DTFM beside their baseline d3rlpy, in turn on one machine: `make bench`.
 
 Prints docs/performance.md's tables of training and acting: medians over repeats, each in a process of its own, and ratios
-of the medians. Peers come from PyPI in an environment of their own.
+of the medians. Baselines come from PyPI in an environment of their own.
 """
 
 import argparse
@@ -76,30 +76,30 @@ def matrix_rate() -> float:
     return 2 * 2048**3 / min(times)
 
 
-def training_table(peer_python: str, repeats: int) -> None:
-    """DT and DTFM, each with three tokens a step and with one, in turn with the peer."""
+def training_table(baseline_python: str, repeats: int) -> None:
+    """DT and DTFM, each with three tokens a step and with one, in turn with the baseline."""
     print(
         "| training | tokens | d3rlpy DT, ms | DT, ms | DTFM, ms | d3rlpy / DT | / DTFM | head | bound, ms | drawing | MiB |"
     )
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     ours = tuple((algo, tokens) for tokens in TOKENS for algo in ("dt", "dtfm"))
     for name, (*size, n_steps) in SIZES.items():
-        peers, rates = [], []
+        baselines, rates = [], []
         runs: dict[tuple[str, int], list[dict[str, float]]] = {each: [] for each in ours}
         for _ in range(repeats):
             rates.append(matrix_rate())
-            peers.append(measure(peer_python, "d3rlpy_worker.py", "train", *size[:2], n_steps))
+            baselines.append(measure(baseline_python, "d3rlpy_worker.py", "train", *size[:2], n_steps))
             for algo, tokens in ours:
                 runs[algo, tokens].append(measure(sys.executable, "worker.py", "train", algo, *size, tokens, n_steps))
-        peer = medians(peers)
+        baseline = medians(baselines)
         for tokens in TOKENS:
             dt, dtfm = (medians(runs[algo, tokens]) for algo in ("dt", "dtfm"))
             bound = matrix_flops(*size, tokens) / statistics.median(rates) * 1e3
             print(
-                f"| {name} | {tokens} | {peer['wall_ms']:.0f} | {dt['wall_ms']:.0f} | {dtfm['wall_ms']:.0f} "
-                f"| {peer['wall_ms'] / dt['wall_ms']:.2f} | {peer['wall_ms'] / dtfm['wall_ms']:.2f} "
+                f"| {name} | {tokens} | {baseline['wall_ms']:.0f} | {dt['wall_ms']:.0f} | {dtfm['wall_ms']:.0f} "
+                f"| {baseline['wall_ms'] / dt['wall_ms']:.2f} | {baseline['wall_ms'] / dtfm['wall_ms']:.2f} "
                 f"| {1 - dt['wall_ms'] / dtfm['wall_ms']:.0%} | {bound:.0f} | {dtfm['sampling_ms'] / dtfm['wall_ms']:.1%} "
-                f"| {peer['peak_mib']:.0f}, {dtfm['peak_mib']:.0f} |",
+                f"| {baseline['peak_mib']:.0f}, {dtfm['peak_mib']:.0f} |",
                 flush=True,
             )
     print(
@@ -108,30 +108,30 @@ def training_table(peer_python: str, repeats: int) -> None:
     )
 
 
-def acting_table(peer_python: str, repeats: int) -> None:
-    """DTFM's ways of acting, with three tokens a step and with one, in turn with the peer."""
+def acting_table(baseline_python: str, repeats: int) -> None:
+    """DTFM's ways of acting, with three tokens a step and with one, in turn with the baseline."""
     print("| acting, width 256, 10 layers | 3 tokens, ms | 1 token, ms | 3 tokens, of d3rlpy's | 1 token, of d3rlpy's |")
     print("| --- | --- | --- | --- | --- |")
     ours = tuple((name, tokens) for name in ACTING for tokens in TOKENS)
-    peers: list[dict[str, float]] = []
+    baselines: list[dict[str, float]] = []
     runs: dict[tuple[str, int], list[dict[str, float]]] = {each: [] for each in ours}
     for _ in range(repeats):
-        peers.append(measure(peer_python, "d3rlpy_worker.py", "act", 256, 10, N_ACTIONS))
+        baselines.append(measure(baseline_python, "d3rlpy_worker.py", "act", 256, 10, N_ACTIONS))
         for name, tokens in ours:
             runs[name, tokens].append(
                 measure(sys.executable, "worker.py", "act", "dtfm", 256, 10, 512, tokens, N_ACTIONS, *ACTING[name])
             )
-    peer = medians(peers)["wall_ms"]
-    print(f"| d3rlpy DT | {peer:.1f} | | 1.00 | |")
+    baseline = medians(baselines)["wall_ms"]
+    print(f"| d3rlpy DT | {baseline:.1f} | | 1.00 | |")
     for name in ACTING:
         times = [medians(runs[name, tokens])["wall_ms"] for tokens in TOKENS]
-        cells = [f"{each:.1f}" for each in times] + [f"{each / peer:.2f}" for each in times]
+        cells = [f"{each:.1f}" for each in times] + [f"{each / baseline:.2f}" for each in times]
         print(f"| {name} | {' | '.join(cells)} |")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--peer-python", required=True, help="Python of an environment with d3rlpy and the same torch")
+    parser.add_argument("--baseline-python", required=True, help="Python of an environment with d3rlpy and the same torch")
     parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args()
     commit = subprocess.run(
@@ -141,8 +141,8 @@ def main() -> None:
     print(
         f"{th.backends.cpu.get_cpu_capability()}, commit {commit.stdout.strip()}, batch {BATCH_SIZE}, K = {CONTEXT_LENGTH}\n"
     )
-    training_table(options.peer_python, options.repeats)
-    acting_table(options.peer_python, options.repeats)
+    training_table(options.baseline_python, options.repeats)
+    acting_table(options.baseline_python, options.repeats)
 
 
 if __name__ == "__main__":

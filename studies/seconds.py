@@ -6,15 +6,15 @@ Seconds from the command to 95 % of what the best tenth of the recorded episodes
 
 Data sets are those of studies/suite.yml. `wall_s` of a row are processor seconds of the learning process since it was
 started: imports, reading the data, and all gradient steps; neither environments nor evaluations. d3rlpy's algorithms need
-`make .venv-peers/installed`. A cell that is finished is not run again, and two calls share the cells between them.
+`make .venv-baselines/installed`. A cell that is finished is not run again, and two calls share the cells between them.
 """
 
 import time
 
 import numpy as np
 import torch as th
-from peers.cells import PROFILE, WORKERS, Peer, read_entries
-from peers.process import PeerProcess
+from baselines.cells import PROFILE, WORKERS, Baseline, read_entries
+from baselines.process import BaselineProcess
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_dtfm.algorithms import ALGORITHMS
@@ -158,20 +158,20 @@ def run_here(job: Job) -> Cell:
     return cell
 
 
-def run_peer(job: Job, peer: Peer, python: Path, log: Path) -> Cell:
+def run_baseline(job: Job, baseline: Baseline, python: Path, log: Path) -> Cell:
     """One of d3rlpy's, in a process of its own."""
-    cell = Cell(job, peer.name)
-    settings = {**peer.settings, **peer.kinds.get(kind(job), {})}
-    with tempfile.TemporaryDirectory() as folder, PeerProcess(python, WORKERS[peer.worker], log) as process:
+    cell = Cell(job, baseline.name)
+    settings = {**baseline.settings, **baseline.kinds.get(kind(job), {})}
+    with tempfile.TemporaryDirectory() as folder, BaselineProcess(python, WORKERS[baseline.worker], log) as process:
         path = Path(folder) / "episodes.npz"
         cell.buffer().save(path)
-        process.begin(path, settings, job.cell.seed, peer.n_timesteps, MINUTES)
-        more: Row = {"profile": PROFILE, "settings": {**job.settings, "minutes": MINUTES, peer.worker: settings}}
+        process.begin(path, settings, job.cell.seed, baseline.n_timesteps, MINUTES)
+        more: Row = {"profile": PROFILE, "settings": {**job.settings, "minutes": MINUTES, baseline.worker: settings}}
         done = 0
-        for step in points(peer.n_timesteps):
+        for step in points(baseline.n_timesteps):
             seconds = process.learn(step - done)
             done = step
-            versions = {f"peer's {name}": number for name, number in process.versions.items()}
+            versions = {f"baseline's {name}": number for name, number in process.versions.items()}
             if cell.evaluate(process, step, seconds, versions={**provenance.versions(), **versions}, **more):
                 break
             if seconds * 2**0.5 > 60.0 * MINUTES:
@@ -180,7 +180,7 @@ def run_peer(job: Job, peer: Peer, python: Path, log: Path) -> Cell:
 
 
 def kind(job: Job) -> str:
-    """What the authors of peers change their settings by."""
+    """What the authors of baselines change their settings by."""
     task = job.task.env_id
     return "arm" if task.startswith("robosuite") else "hand" if task.startswith("AdroitHand") else "gait"
 
@@ -210,8 +210,8 @@ def run_cell(options: argparse.Namespace, data: str, algo: str, seed: int, path:
     if algo in OURS:
         cell = run_here(job)
     else:
-        peers = read_entries(HERE / "peers" / "settings.yml", Peer)
-        cell = run_peer(job, peers[algo], options.python, path.with_suffix(".log"))
+        baselines = read_entries(HERE / "baselines" / "settings.yml", Baseline)
+        cell = run_baseline(job, baselines[algo], options.python, path.with_suffix(".log"))
     cell.write(path)
     last = cell.rows[-1]
     value = reached(Episodes(last["returns"], [], last["successes"]))
@@ -292,7 +292,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=OUR_STEPS, help="gradient steps of ours and of behaviour cloning")
     parser.add_argument("--label", default="", help="name of what -params and --steps change")
     parser.add_argument("-params", dest="hyperparams", nargs="+", default=[], metavar="KEY:VALUE")
-    parser.add_argument("--python", type=Path, default=HERE.parent / ".venv-peers/bin/python", help="that has d3rlpy")
+    parser.add_argument("--python", type=Path, default=HERE.parent / ".venv-baselines/bin/python", help="that has d3rlpy")
     parser.add_argument("--write", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--figure", type=Path, help="PNG file to draw")
     options = parser.parse_args()

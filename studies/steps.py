@@ -3,7 +3,7 @@ What a gradient step takes beside its matrix products alone: docs/performance.md
 
     OMP_NUM_THREADS=1 python studies/steps.py defaults             # what the data decide, a minute
     OMP_NUM_THREADS=1 python studies/steps.py sizes                # larger and smaller ones
-    OMP_NUM_THREADS=1 python studies/steps.py sizes --before CHECKOUT --d3rlpy .venv-peers/bin/python
+    OMP_NUM_THREADS=1 python studies/steps.py sizes --before CHECKOUT --d3rlpy .venv-baselines/bin/python
 
 in turn with another version of this package, and with d3rlpy's Decision Transformer of the same width and depth, of which a
 step has 64 windows of 20 steps. Every measurement has a process of its own. Products are those that a step computes, of the
@@ -181,8 +181,8 @@ def line(name: str, options: argparse.Namespace) -> str:
                 before = run(name, options.before.resolve(), precision)["step"]
                 keep(**{precision: before, f"{precision} / now": before / now["step"]})
         if options.d3rlpy and STEPS[name].context_length == 20:
-            peer = run_d3rlpy(options.d3rlpy.absolute(), STEPS[name])
-            keep(d3rlpy=peer, **{"d3rlpy / now": peer / now["step"]})
+            baseline = run_d3rlpy(options.d3rlpy.absolute(), STEPS[name])
+            keep(d3rlpy=baseline, **{"d3rlpy / now": baseline / now["step"]})
     columns = [f"{statistics.median(found[key]):.2f}" if key in found else "-" for key in COLUMNS]
     return f"| {name} | {' | '.join(columns)} |"
 

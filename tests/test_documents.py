@@ -222,10 +222,10 @@ def understand(words: list[str]) -> None:
 
 
 def understand_peers(arguments: str) -> None:
-    """What `make peers` passes on."""
+    """What `make baselines` passes on."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(ROOT / "studies"))
-        command = importlib.import_module("peers.command")
+        command = importlib.import_module("baselines.command")
     command.parse_arguments(shlex.split(arguments))
 
 

@@ -1,10 +1,10 @@
-"""A peer that needs NumPy alone: a linear map, whose last action tells how long its environment's episode has been."""
+"""A baseline that needs NumPy alone: a linear map, whose last action tells how long its environment's episode has been."""
 
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from peers.protocol import Dataset, serve
+from baselines.protocol import Dataset, serve
 
 
 class LinearLearner:

@@ -1,5 +1,5 @@
 """
-What a peer's process and ours say to each other, and what every peer needs: NumPy alone, as its environment lacks sb3_dtfm.
+What a baseline's process and ours say to each other, and what every baseline needs: NumPy alone, as its environment lacks sb3_dtfm.
 
 A message is a line of JSON, which names the arrays after it with their types and shapes, and the bytes of these arrays.
 """
@@ -17,7 +17,7 @@ from typing import Any, BinaryIO, NamedTuple, Protocol
 import numpy as np
 
 PROGRESS_INTERVAL = 0.5  # seconds
-# What a peer's speed is measured by before its training is planned.
+# What a baseline's speed is measured by before its training is planned.
 TRIAL_SECONDS, TRIAL_STEPS, FIRST_STEPS = 10.0, 500, 10
 TIMED_ACTIONS = 16
 
@@ -85,7 +85,7 @@ class Episode(NamedTuple):
 
 class Dataset(NamedTuple):
     """
-    What a peer learns from.
+    What a baseline learns from.
 
     :param episodes: at least one
     :param low: (A,) smallest action
@@ -120,7 +120,7 @@ def read_dataset(path: str) -> Dataset:
 
 
 class Learner(Protocol):
-    """A peer, ready to learn."""
+    """A baseline, ready to learn."""
 
     def learn(self, n_steps: int, after_step: Callable[[], None]) -> None:
         """
@@ -222,7 +222,7 @@ def serve(make: MakeLearner, packages: tuple[str, ...]) -> None:
     Train as asked for and act, until the other side is gone: what a worker's main is. It is asked on the standard input and
     answers into the file descriptor that its argument names, since libraries print, some as they are imported.
 
-    :param make: makes the peer
+    :param make: makes the baseline
     :param packages: whose versions are told
     """
     questions, answers = sys.stdin.buffer, os.fdopen(int(sys.argv[1]), "wb")

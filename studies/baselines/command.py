@@ -1,8 +1,8 @@
 """
-DT, DTFM and their peers, trained and evaluated on the same data and initial states, one core each: `make peers`.
+DT, DTFM and their baselines, trained and evaluated on the same data and initial states, one core each: `make baselines`.
 
-    make peers                                                          # everything of studies/peers.yml
-    make peers ARGUMENTS="--data can-few --algo dt dtfm bc --seeds 0"    # some of it
+    make baselines                                                          # everything of studies/baselines.yml
+    make baselines ARGUMENTS="--data can-few --algo dt dtfm bc --seeds 0"    # some of it
     python studies/summary.py mine                                      # the rows as a table
 
 A cell that is finished in the results folder is not run again; a kill loses at most the running one (ours goes on from its
@@ -23,20 +23,20 @@ import yaml
 from filelock import FileLock, Timeout
 from tqdm import tqdm
 
-from peers.cells import (
+from baselines.cells import (
     HERE,
     KINDS,
     WORKERS,
+    Baseline,
     Data,
-    Peer,
+    baseline_cell,
     budget_of,
     check_same,
-    peer_cell,
     read_entries,
     row_settings,
-    run_peer,
+    run_baseline,
 )
-from peers.process import STUDIES, PeerError
+from baselines.process import STUDIES, BaselineError
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.provenance import read_data
 from sb3_dtfm.benchmark.rows import write_row
@@ -45,20 +45,20 @@ from sb3_dtfm.data import DatasetError
 from sb3_dtfm.files import replacing
 from sb3_dtfm.zoo.arguments import UsageError, import_packages, key_values
 
-FOLDERS = {"d3rlpy": ".venv-peers", "robomimic": ".venv-robomimic"}  # the environments of the Makefile
+FOLDERS = {"d3rlpy": ".venv-baselines", "robomimic": ".venv-robomimic"}  # the environments of the Makefile
 
 
 def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
     """
     :raises UsageError: a number out of range
     """
-    parser = argparse.ArgumentParser("peers", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser("baselines", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--data", nargs="+", metavar="NAME", help="datasets of --datasets; all by default, but those of tasks not installed")
-    add("--algo", dest="algos", nargs="+", metavar="NAME", help="dt, dtfm, and peers of --settings; all by default")
+    add("--algo", dest="algos", nargs="+", metavar="NAME", help="dt, dtfm, and baselines of --settings; all by default")
     add("--seeds", type=int, nargs="+", default=[0, 1, 2], metavar="SEED", help="0 1 2 by default")
-    add("--minutes", type=float, metavar="N", help="of a peer's training on one core; the dataset's by default")
-    add("--steps", type=int, metavar="N", help="gradient steps, instead of a peer's minutes or our settings'")
+    add("--minutes", type=float, metavar="N", help="of a baseline's training on one core; the dataset's by default")
+    add("--steps", type=int, metavar="N", help="gradient steps, instead of a baseline's minutes or our settings'")
     add("--label", default="", help="added to the dataset's name in the rows, for what was changed")
     several: dict[str, Any] = {"nargs": "+", "action": "extend", "default": []}
     add(
@@ -66,14 +66,14 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
         "--hyperparams",
         **several,
         metavar="KEY:VALUE",
-        help="settings to change, of peers or ours; needs --label",
+        help="settings to change, of baselines or ours; needs --label",
     )
     add("--final-episodes", type=int, default=100, metavar="N", help="100 by default")
     add("--n-eval-envs", type=int, default=10, metavar="N", help="environments side by side; 10 by default")
     add("-o", "--results", default="mine", metavar="DIR", help="where rows go; mine by default")
-    add("-f", "--log-folder", default="logs/peers", metavar="DIR", help="models and logs; logs/peers by default")
-    add("--datasets", type=Path, default=STUDIES / "peers.yml", metavar="FILE", help="what the datasets are")
-    add("--settings", type=Path, default=HERE / "settings.yml", metavar="FILE", help="the peers' settings")
+    add("-f", "--log-folder", default="logs/baselines", metavar="DIR", help="models and logs; logs/baselines by default")
+    add("--datasets", type=Path, default=STUDIES / "baselines.yml", metavar="FILE", help="what the datasets are")
+    add("--settings", type=Path, default=HERE / "settings.yml", metavar="FILE", help="the baselines' settings")
     for worker, folder in FOLDERS.items():
         add(f"--{worker}-python", default=f"{folder}/bin/python", metavar="PYTHON", help=f"of an environment with {worker}")
     options = parser.parse_args(argv)
@@ -118,21 +118,23 @@ def ready(data: Data, asked_for: bool) -> bool:
     try:
         read_data(data.task, data.settings())
     except DatasetError as error:
-        raise UsageError(f"{data.name}: {error} studies/peers.yml says how to record it; --data chooses others.") from error
+        raise UsageError(
+            f"{data.name}: {error} studies/baselines.yml says how to record it; --data chooses others."
+        ) from error
     return True
 
 
-def check_workers(peers: Sequence[Peer], options: argparse.Namespace) -> None:
+def check_workers(baselines: Sequence[Baseline], options: argparse.Namespace) -> None:
     """
     :raises UsageError: a worker's environment is missing
     """
-    for worker in sorted({peer.worker for peer in peers}):
+    for worker in sorted({baseline.worker for baseline in baselines}):
         if worker not in WORKERS:
             raise UsageError(f"{options.settings}: worker is {worker!r}; accepted are {', '.join(WORKERS)}.")
         python = Path(getattr(options, f"{worker}_python"))
         if not python.exists():
             raise UsageError(
-                f"--{worker}-python: {python} does not exist; `make peers` installs it, or --algo leaves it out."
+                f"--{worker}-python: {python} does not exist; `make baselines` installs it, or --algo leaves it out."
             )
 
 
@@ -164,13 +166,13 @@ def run_ours(data: Data, algos: Sequence[str], seed: int, options: argparse.Name
     return 0
 
 
-def run_cell(data: Data, peer: Peer, seed: int, options: argparse.Namespace) -> int:
+def run_cell(data: Data, baseline: Baseline, seed: int, options: argparse.Namespace) -> int:
     """
-    Run a peer's cell, unless it is finished or another call of the command is at it.
+    Run a baseline's cell, unless it is finished or another call of the command is at it.
 
     :return: 1 if it is not finished
     """
-    cell = peer_cell(data, peer, seed, options.label)
+    cell = baseline_cell(data, baseline, seed, options.label)
     results, logs = Path(options.results), Path(options.log_folder)
     (results / ".locks").mkdir(parents=True, exist_ok=True)
     logs.mkdir(parents=True, exist_ok=True)
@@ -178,7 +180,7 @@ def run_cell(data: Data, peer: Peer, seed: int, options: argparse.Namespace) -> 
     try:
         with FileLock(results / ".locks" / f"{cell.file_name}.lock").acquire(timeout=0):
             if rows.exists():
-                check_same(rows, row_settings(data, peer, budget_of(data, peer, options)))
+                check_same(rows, row_settings(data, baseline, budget_of(data, baseline, options)))
                 print(f"{cell}: finished already", flush=True)
                 return 0
             start = time.monotonic()
@@ -189,13 +191,13 @@ def run_cell(data: Data, peer: Peer, seed: int, options: argparse.Namespace) -> 
                     bar.set_postfix_str(what, refresh=False)
                     bar.update(done - bar.n)
 
-                row = run_peer(data, peer, seed, options, log, say)
+                row = run_baseline(data, baseline, seed, options, log, say)
             with replacing(rows) as beside:
                 write_row(beside, row)
     except Timeout:
         print(f"{cell}: another process is running it", flush=True)
         return 1
-    except PeerError as error:
+    except BaselineError as error:
         print(f"{cell}: FAILED. {error}", flush=True)
         return 1
     minutes = row["wall_s"] / 60
@@ -214,20 +216,20 @@ def main(argv: Sequence[str]) -> None:
     :raises UsageError: something does not fit; nothing was run
     """
     options = parse_arguments(argv)
-    known_data, known_peers = read_entries(options.datasets, Data), read_entries(options.settings, Peer)
-    algos = choose(options.algos, [*ALGORITHMS, *known_peers], "--algo")
-    ours, peers = (
+    known_data, known_baseline = read_entries(options.datasets, Data), read_entries(options.settings, Baseline)
+    algos = choose(options.algos, [*ALGORITHMS, *known_baseline], "--algo")
+    ours, baselines = (
         [name for name in algos if name in ALGORITHMS],
-        [known_peers[name].changed(options.hyperparams) for name in algos if name in known_peers],
+        [known_baseline[name].changed(options.hyperparams) for name in algos if name in known_baseline],
     )
-    check_workers(peers, options)
+    check_workers(baselines, options)
     names = choose(options.data, list(known_data), "--data")
     chosen = [known_data[name] for name in names if ready(known_data[name], asked_for=options.data is not None)]
     n_left = 0
     for seed in dict.fromkeys(options.seeds):  # outermost: a run that is cut short has seen all data
         for data in chosen:
             n_left += run_ours(data, ours, seed, options) if ours else 0
-            n_left += sum(run_cell(data, peer, seed, options) for peer in peers if data.kind in peer.only)
+            n_left += sum(run_cell(data, baseline, seed, options) for baseline in baselines if data.kind in baseline.only)
     if n_left:
         print("Some cells failed, or are left to other processes; the same command goes on.")
         raise SystemExit(1)
@@ -248,4 +250,4 @@ def run() -> None:
             print("Interrupted; the same command goes on.", flush=True)
         raise SystemExit(130) from None
     except UsageError as error:
-        raise SystemExit(f"peers: {error}") from None
+        raise SystemExit(f"baselines: {error}") from None

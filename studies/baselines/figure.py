@@ -1,7 +1,7 @@
 """
-The rows of `make peers` as a picture: each algorithm's mean, as a share of the best one's on the same data.
+The rows of `make baselines` as a picture: each algorithm's mean, as a share of the best one's on the same data.
 
-    PYTHONPATH=studies python -m peers.figure results/baselines.csv docs/studies/peers.png
+    PYTHONPATH=studies python -m baselines.figure results/baselines.csv docs/studies/baselines.png
 """
 
 import argparse
@@ -13,11 +13,11 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from peers.table import Cells, read
+from baselines.table import Cells, read
 
 # Ours in colours of their own, the others in grey shapes.
 OURS = {"dt": ("DT", "D", "C1"), "dtfm": ("DTFM", "o", "C0"), "dtfm, guided": ("DTFM, best-of-N", "*", "C3")}
-PEERS = {
+OTHERS = {
     "d3rlpy-dt": ("d3rlpy's DT", "s"),
     "bc": ("BC", "v"),
     "bc-best": ("BC of the best 10 %", "^"),
@@ -37,7 +37,7 @@ def plot(folder: Path, output: Path) -> None:
     figure = Figure(figsize=(9.0, 0.42 * len(datasets) + 1.0), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
-    styles = {name: (label, marker, "0.55", 5.0) for name, (label, marker) in PEERS.items()}
+    styles = {name: (label, marker, "0.55", 5.0) for name, (label, marker) in OTHERS.items()}
     styles |= {name: (*style, 8.0) for name, style in OURS.items()}
     for algo, (label, marker, colour, size) in styles.items():
         shares = {row: _mean(cells, name, algo) / _best(cells, name, styles) for row, name in enumerate(datasets)}

@@ -1,4 +1,4 @@
-"""A peer in a process of its own, which acts here like an SB3 model."""
+"""A baseline in a process of its own, which acts here like an SB3 model."""
 
 import contextlib
 import os
@@ -11,14 +11,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from peers.protocol import Message, receive, send
+from baselines.protocol import Message, receive, send
 
 STUDIES = Path(__file__).parents[1]
 PATIENCE = 10.0  # seconds that a process has to end
 
 
-class PeerError(RuntimeError):
-    """A peer's process has ended too early. The message names its log and the last line of it."""
+class BaselineError(RuntimeError):
+    """A baseline's process has ended too early. The message names its log and the last line of it."""
 
 
 class Training(NamedTuple):
@@ -35,14 +35,14 @@ class Training(NamedTuple):
     processor_seconds: float
 
 
-class PeerProcess:
+class BaselineProcess:
     """
-    A peer's worker on one core: :meth:`train` it, then ask it for actions, in a `with` statement.
+    A baseline's worker on one core: :meth:`train` it, then ask it for actions, in a `with` statement.
 
-    :param python: Python of the environment that has the peer's packages
-    :param module: the worker, which calls :func:`~peers.protocol.serve`
+    :param python: Python of the environment that has the baseline's packages
+    :param module: the worker, which calls :func:`~baselines.protocol.serve`
     :param log: file that gets what the worker prints
-    :ivar versions: of the peer's packages, by name, once it is training
+    :ivar versions: of the baseline's packages, by name, once it is training
     """
 
     def __init__(self, python: Path, module: str, log: Path) -> None:
@@ -65,7 +65,7 @@ class PeerProcess:
         os.close(told)
         self._answers = os.fdopen(answers, "rb")
 
-    def __enter__(self) -> "PeerProcess":
+    def __enter__(self) -> "BaselineProcess":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -98,7 +98,7 @@ class PeerProcess:
         :param n_timesteps: gradient steps
         :param minutes: of one core, which may be less than that many steps take; None for all of them
         :param on_progress: told how many steps of how many are done
-        :raises PeerError: it has ended
+        :raises BaselineError: it has ended
         """
         self._begin(dataset, settings, seed, n_timesteps, minutes, in_parts=False)
         while (message := self._receive()).what == "progress":
@@ -109,7 +109,7 @@ class PeerProcess:
         """
         Have it ready to :meth:`learn` in parts; the arguments are those of :meth:`train`, and plan its schedules.
 
-        :raises PeerError: it has ended
+        :raises BaselineError: it has ended
         """
         self._begin(dataset, settings, seed, n_timesteps, minutes, in_parts=True)
 
@@ -119,7 +119,7 @@ class PeerProcess:
 
         :param n_steps: how many
         :return: processor seconds of its process since it was started, without those of acting
-        :raises PeerError: it has ended
+        :raises BaselineError: it has ended
         """
         self._send("learn", n_steps=n_steps)
         return self._receive().values["processor_seconds"]
@@ -137,17 +137,17 @@ class PeerProcess:
         deterministic: bool = True,
     ) -> tuple[np.ndarray, None]:
         """
-        Actions (n_envs, A), as an SB3 model's `predict` has them. What a peer remembers of an episode stays with it.
+        Actions (n_envs, A), as an SB3 model's `predict` has them. What a baseline remembers of an episode stays with it.
 
         :param observation: of `ReturnToGoWrapper`, (n_envs, .) each
         :param state: none
         :param episode_start: (n_envs,); the rows of an episode's first step are needed
-        :param deterministic: peers act so alone
+        :param deterministic: baselines act so alone
         :raises ValueError: no `episode_start`, or not deterministic
-        :raises PeerError: it has ended
+        :raises BaselineError: it has ended
         """
         if episode_start is None or not deterministic:
-            raise ValueError("A peer needs episode_start and acts deterministically alone.")
+            raise ValueError("A baseline needs episode_start and acts deterministically alone.")
         questions = {
             "observations": np.asarray(observation["observation"], np.float32),
             "returns_to_go": np.asarray(observation["return_to_go"], np.float64).reshape(-1),
@@ -160,7 +160,7 @@ class PeerProcess:
         """
         Milliseconds of an action in one environment, of all so far, without the way through the pipe.
 
-        :raises PeerError: it has ended
+        :raises BaselineError: it has ended
         """
         self._send("timing")
         return self._receive().values["action_ms"]
@@ -177,7 +177,7 @@ class PeerProcess:
         except EOFError:
             raise self._ended() from None
 
-    def _ended(self) -> PeerError:
+    def _ended(self) -> BaselineError:
         code = self._process.wait(PATIENCE)
         said = self._log.read_text().strip().splitlines() or ["nothing was written"]
-        return PeerError(f"{self._module} has ended with code {code}, see {self._log}: {said[-1]}")
+        return BaselineError(f"{self._module} has ended with code {code}, see {self._log}: {said[-1]}")

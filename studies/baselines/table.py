@@ -1,9 +1,9 @@
 """
-The rows of `make peers` as a table: success in percent or return, mean over seeds and its 95 % interval (Student's t).
+The rows of `make baselines` as a table: success in percent or return, mean over seeds and its 95 % interval (Student's t).
 
-    PYTHONPATH=studies python -m peers.table results/baselines.csv           # a line for each dataset and algorithm
-    PYTHONPATH=studies python -m peers.table results/baselines.csv --short   # a line for each dataset
-    PYTHONPATH=studies python -m peers.table results/baselines.csv --suite results/suite.csv   # and our defaults
+    PYTHONPATH=studies python -m baselines.table results/baselines.csv           # a line for each dataset and algorithm
+    PYTHONPATH=studies python -m baselines.table results/baselines.csv --short   # a line for each dataset
+    PYTHONPATH=studies python -m baselines.table results/baselines.csv --suite results/suite.csv   # and our defaults
 """
 
 import argparse
@@ -13,22 +13,22 @@ from pathlib import Path
 
 import numpy as np
 
-from peers.cells import HERE, Data, Peer, read_entries
-from peers.process import STUDIES
+from baselines.cells import HERE, Baseline, Data, read_entries
+from baselines.process import STUDIES
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.report.runs import Run, read_studies
 from sb3_dtfm.benchmark.report.statistics import student_t
 
 NONE = "-"
 Cells = dict[tuple[str, str], list[Run]]  # by dataset and algorithm
-# What studies/suite.yml calls a dataset of studies/peers.yml, where it has another name there.
+# What studies/suite.yml calls a dataset of studies/baselines.yml, where it has another name there.
 IN_SUITE = {"can-few": "can-10", "walker2d-clean": "walker2d-expert", "pusht-human": "pusht"}
 
 
 def read(folder: Path) -> tuple[Cells, list[str], list[str]]:
     """The runs, their datasets and their algorithms, as the YAML files have them; the rest of a label names the latter."""
-    datasets = list(read_entries(STUDIES / "peers.yml", Data))
-    known = [*ALGORITHMS, *read_entries(HERE / "settings.yml", Peer)]
+    datasets = list(read_entries(STUDIES / "baselines.yml", Data))
+    known = [*ALGORITHMS, *read_entries(HERE / "settings.yml", Baseline)]
     cells: Cells = {}
     for group in (group for study in read_studies([folder]) for group in study.groups):
         name = max((each for each in datasets if f"{group.label}-".startswith(f"{each}-")), key=len)

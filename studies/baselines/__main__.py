@@ -1,9 +1,9 @@
-"""See :mod:`peers.command`."""
+"""See :mod:`baselines.command`."""
 
 import os
 
 os.environ["OMP_NUM_THREADS"] = "1"  # before PyTorch counts the cores
 
-from peers.command import run
+from baselines.command import run
 
 run()

@@ -1,4 +1,4 @@
-"""What `make peers` is to run: its data and its peers, from their YAML files, and a row for each peer's training."""
+"""What `make baselines` is to run: its data and its baselines, from their YAML files, and a row for each baseline's training."""
 
 import argparse
 import contextlib
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import torch as th
 
-from peers.process import PeerProcess
+from baselines.process import BaselineProcess
 from sb3_dtfm.benchmark import provenance
 from sb3_dtfm.benchmark.evaluation import FINAL_STATES, evaluate, make_seeded_envs
 from sb3_dtfm.benchmark.rows import Cell, Row, read_rows
@@ -20,10 +20,10 @@ from sb3_dtfm.envs import known_task
 from sb3_dtfm.zoo.arguments import UsageError
 
 HERE = Path(__file__).parent
-PROFILE = "authors"  # what the rows call the peers' settings
+PROFILE = "authors"  # what the rows call the baselines' settings
 KINDS = ("gait", "hand", "arm")
 # Name: the module that its environment runs.
-WORKERS = {"d3rlpy": "peers.worker_d3rlpy", "robomimic": "peers.worker_robomimic"}
+WORKERS = {"d3rlpy": "baselines.worker_d3rlpy", "robomimic": "baselines.worker_robomimic"}
 
 
 class Data(NamedTuple):
@@ -35,12 +35,12 @@ class Data(NamedTuple):
     :param kind: one of `KINDS`
     :param dataset: Minari id, robomimic file or flat arrays
     :param target_return: asked for when acting, in reward units
-    :param minutes: of a peer's training on one core
+    :param minutes: of a baseline's training on one core
     :param fraction: share of the episodes to learn from
     :param n_timesteps: our gradient steps, None for the profile's
     :param profile: our settings
     :param params: changes to them
-    :param peers: changes to the peers' settings, by peer
+    :param baselines: changes to the baselines' settings, by baseline
     :param gym_packages: to import first
     :param recorded_from: who made the data
     """
@@ -55,7 +55,7 @@ class Data(NamedTuple):
     n_timesteps: int | None = None
     profile: str = "default"
     params: dict[str, Any] = {}  # noqa: RUF012 - never changed
-    peers: dict[str, dict[str, Any]] = {}  # noqa: RUF012
+    baselines: dict[str, dict[str, Any]] = {}  # noqa: RUF012
     gym_packages: list[str] = []  # noqa: RUF012
     recorded_from: str | None = None
 
@@ -75,9 +75,9 @@ class Data(NamedTuple):
         return task_settings(self.profile, "dt", task, self.fraction, self.n_timesteps, self.params)
 
 
-class Peer(NamedTuple):
+class Baseline(NamedTuple):
     """
-    One peer at its authors' settings.
+    One baseline at its authors' settings.
 
     :param name: what the rows have for an algorithm
     :param worker: one of `WORKERS`
@@ -100,11 +100,11 @@ class Peer(NamedTuple):
 
     def settings_for(self, data: Data) -> dict[str, Any]:
         """The worker's settings for a dataset."""
-        return {**self.settings, **self.kinds.get(data.kind, {}), **data.peers.get(self.name, {}), **self.changes}
+        return {**self.settings, **self.kinds.get(data.kind, {}), **data.baselines.get(self.name, {}), **self.changes}
 
-    def changed(self, changes: Mapping[str, Any]) -> "Peer":
+    def changed(self, changes: Mapping[str, Any]) -> "Baseline":
         """
-        The peer with other settings.
+        The baseline with other settings.
 
         :param changes: the worker's settings, or `best_share`, by name
         :raises UsageError: a name that it has not
@@ -121,7 +121,7 @@ def read_entries(path: Path, entry: type[Any]) -> dict[str, Any]:
     The entries of a YAML file by name.
 
     :param path: of the file
-    :param entry: :class:`Data` or :class:`Peer`
+    :param entry: :class:`Data` or :class:`Baseline`
     :raises UsageError: another key than the entry has, or one is missing
     """
     keys, needed = set(entry._fields) - {"name"}, set(entry._fields) - {"name"} - set(entry._field_defaults)
@@ -135,14 +135,14 @@ def read_entries(path: Path, entry: type[Any]) -> dict[str, Any]:
     return found
 
 
-def peer_cell(data: Data, peer: Peer, seed: int, label: str = "") -> Cell:
-    """What a peer's training on a dataset is known by."""
-    return Cell(data.task, data.fraction, peer.name, seed, PROFILE, "-".join(filter(None, (data.name, label))))
+def baseline_cell(data: Data, baseline: Baseline, seed: int, label: str = "") -> Cell:
+    """What a baseline's training on a dataset is known by."""
+    return Cell(data.task, data.fraction, baseline.name, seed, PROFILE, "-".join(filter(None, (data.name, label))))
 
 
-def export(data: Data, peer: Peer, path: Path, max_episode_steps: int | None) -> TrajectoryBuffer:
+def export(data: Data, baseline: Baseline, path: Path, max_episode_steps: int | None) -> TrajectoryBuffer:
     """
-    Write the episodes that a peer is to learn from, as flat arrays.
+    Write the episodes that a baseline is to learn from, as flat arrays.
 
     :param path: of the `.npz` file
     :param max_episode_steps: the environment's, up to which ours learn from them
@@ -152,15 +152,15 @@ def export(data: Data, peer: Peer, path: Path, max_episode_steps: int | None) ->
     options = {"max_episode_steps": max_episode_steps, **(settings.get("dataset_kwargs") or {})}
     buffer = load_dataset(settings["dataset"], **options)
     buffer = buffer.random_fraction(settings["dataset_fraction"], settings["dataset_seed"])
-    if peer.best_share is not None:
-        buffer = buffer.best(best_share=peer.best_share)
+    if baseline.best_share is not None:
+        buffer = buffer.best(best_share=baseline.best_share)
     buffer.save(path)
     return buffer
 
 
 class Budget(NamedTuple):
     """
-    How long a peer learns.
+    How long a baseline learns.
 
     :param n_timesteps: gradient steps, at most
     :param minutes: of one core, at most; None for all of these steps
@@ -170,17 +170,23 @@ class Budget(NamedTuple):
     minutes: float | None
 
 
-def budget_of(data: Data, peer: Peer, options: argparse.Namespace) -> Budget:
+def budget_of(data: Data, baseline: Baseline, options: argparse.Namespace) -> Budget:
     """As asked for, or else the authors' steps in the minutes of the dataset."""
     if options.steps is not None:
         return Budget(options.steps, None)
-    return Budget(peer.n_timesteps, float(data.minutes if options.minutes is None else options.minutes))
+    return Budget(baseline.n_timesteps, float(data.minutes if options.minutes is None else options.minutes))
 
 
-def row_settings(data: Data, peer: Peer, budget: Budget) -> dict[str, Any]:
+def row_settings(data: Data, baseline: Baseline, budget: Budget) -> dict[str, Any]:
     """What a row has for settings: the episodes, the environment, the budget, and the worker's."""
-    share = {} if peer.best_share is None else {"best_share": peer.best_share}
-    return {**data.settings(), **budget._asdict(), **share, "worker": peer.worker, peer.worker: peer.settings_for(data)}
+    share = {} if baseline.best_share is None else {"best_share": baseline.best_share}
+    return {
+        **data.settings(),
+        **budget._asdict(),
+        **share,
+        "worker": baseline.worker,
+        baseline.worker: baseline.settings_for(data),
+    }
 
 
 def check_same(rows: Path, settings: dict[str, Any]) -> None:
@@ -197,40 +203,40 @@ def check_same(rows: Path, settings: dict[str, Any]) -> None:
         )
 
 
-def run_peer(
-    data: Data, peer: Peer, seed: int, options: argparse.Namespace, log: Path, say: Callable[[int, int, str], None]
+def run_baseline(
+    data: Data, baseline: Baseline, seed: int, options: argparse.Namespace, log: Path, say: Callable[[int, int, str], None]
 ) -> Row:
     """
-    Train a peer, and let it play the final episodes of the benchmark.
+    Train a baseline, and let it play the final episodes of the benchmark.
 
     :param log: file that gets what its process prints
     :param say: told the step, the number of steps, and what is being done
     :return: the row of its final evaluation
-    :raises PeerError: its process has ended
+    :raises BaselineError: its process has ended
     """
-    budget = budget_of(data, peer, options)
-    python = Path(getattr(options, f"{peer.worker}_python"))
+    budget = budget_of(data, baseline, options)
+    python = Path(getattr(options, f"{baseline.worker}_python"))
     vec_env = make_seeded_envs(data.task, data.settings(), options.n_eval_envs)
     with (
         contextlib.closing(vec_env),
-        PeerProcess(python, WORKERS[peer.worker], log) as process,
+        BaselineProcess(python, WORKERS[baseline.worker], log) as process,
         tempfile.TemporaryDirectory() as folder,
     ):
         path = Path(folder) / "episodes.npz"
-        export(data, peer, path, task.max_episode_steps if (task := known_task(vec_env)) else None)
+        export(data, baseline, path, task.max_episode_steps if (task := known_task(vec_env)) else None)
         training = process.train(
-            path, peer.settings_for(data), seed, *budget, lambda done, n_steps: say(done, n_steps, "training")
+            path, baseline.settings_for(data), seed, *budget, lambda done, n_steps: say(done, n_steps, "training")
         )
         seeds = range(FINAL_STATES, FINAL_STATES + options.final_episodes)
         n_steps = training.n_steps
         episodes = evaluate(process, vec_env, seeds, lambda n: say(n_steps, n_steps, f"evaluation {n}/{len(seeds)}"))
         action_ms = process.action_ms()
     return {
-        **peer_cell(data, peer, seed, options.label)._asdict(),
-        "settings": row_settings(data, peer, budget),
+        **baseline_cell(data, baseline, seed, options.label)._asdict(),
+        "settings": row_settings(data, baseline, budget),
         "data": provenance.describe_data(provenance.read_data(data.task, data.settings()), data.dataset, data.recorded_from),
         "commit": provenance.commit(),
-        "versions": {**provenance.versions(), **{f"peer's {name}": number for name, number in process.versions.items()}},
+        "versions": {**provenance.versions(), **{f"baseline's {name}": number for name, number in process.versions.items()}},
         "step": n_steps,
         "final": True,
         **episodes._asdict(),

@@ -1,4 +1,4 @@
-"""Peers learn from what ours learn from, act where ours act, and their rows are rows."""
+"""Baselines learn from what ours learn from, act where ours act, and their rows are rows."""
 
 import io
 import subprocess
@@ -10,11 +10,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from baselines import cells, command, figure, table
+from baselines.process import BaselineError, BaselineProcess
+from baselines.protocol import read_dataset, receive, send
 from gymnasium import spaces
 from matplotlib.axes import Axes
-from peers import cells, command, figure, table
-from peers.process import PeerError, PeerProcess
-from peers.protocol import read_dataset, receive, send
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.evaluation import FINAL_STATES, evaluate, make_seeded_envs
@@ -24,15 +24,15 @@ from sb3_dtfm.zoo.arguments import UsageError
 
 ROOT = Path(__file__).parents[2]
 TINY = "tests.studies.tiny_worker"
-PEERS = cells.read_entries(cells.HERE / "settings.yml", cells.Peer)
-# Each peer with all the settings that it has, and a kind of task for each.
-SETTINGS = [(name, kind) for name, peer in PEERS.items() for kind in dict.fromkeys((peer.only[0], *peer.kinds))]
+OTHERS = cells.read_entries(cells.HERE / "settings.yml", cells.Baseline)
+# Each baseline with all the settings that it has, and a kind of task for each.
+SETTINGS = [(name, kind) for name, baseline in OTHERS.items() for kind in dict.fromkeys((baseline.only[0], *baseline.kinds))]
 PYTHONS = {worker: ROOT / folder / "bin" / "python" for worker, folder in command.FOLDERS.items()}
 
 
 @pytest.fixture(autouse=True)
 def at_the_root(monkeypatch):
-    """As `make peers` is called; the tiny worker is found from here."""
+    """As `make baselines` is called; the tiny worker is found from here."""
     monkeypatch.chdir(ROOT)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
 
@@ -53,16 +53,16 @@ def buffer() -> TrajectoryBuffer:
 
 @pytest.fixture
 def datasets(tmp_path, buffer) -> Path:
-    """A file like studies/peers.yml, of one dataset."""
+    """A file like studies/baselines.yml, of one dataset."""
     buffer.save(tmp_path / "pendulum.npz")
-    (tmp_path / "peers.yml").write_text(
+    (tmp_path / "baselines.yml").write_text(
         f"pendulum: {{task: Pendulum-v1, kind: arm, dataset: {tmp_path / 'pendulum.npz'}, target_return: 0, minutes: 1}}\n"
     )
-    return tmp_path / "peers.yml"
+    return tmp_path / "baselines.yml"
 
 
-def tiny_process(tmp_path: Path) -> PeerProcess:
-    return PeerProcess(Path(sys.executable), TINY, tmp_path / "log")
+def tiny_process(tmp_path: Path) -> BaselineProcess:
+    return BaselineProcess(Path(sys.executable), TINY, tmp_path / "log")
 
 
 def test_a_message_arrives_as_it_was_sent():
@@ -85,7 +85,7 @@ def test_a_message_arrives_as_it_was_sent():
 @pytest.mark.parametrize(("fraction", "best_share", "limit"), [(1.0, None, None), (0.6, None, 8), (1.0, 0.4, 9)])
 def test_a_peer_is_given_the_steps_that_ours_learn_from(datasets, buffer, tmp_path, fraction, best_share, limit):
     data = cells.read_entries(datasets, cells.Data)["pendulum"]._replace(fraction=fraction)
-    cells.export(data, cells.Peer("any", "d3rlpy", 1, {}, best_share=best_share), tmp_path / "out.npz", limit)
+    cells.export(data, cells.Baseline("any", "d3rlpy", 1, {}, best_share=best_share), tmp_path / "out.npz", limit)
     expected = load_dataset(buffer, max_episode_steps=limit).random_fraction(fraction, seed=0)
     expected = expected if best_share is None else expected.best(best_share=best_share)
     given = read_dataset(tmp_path / "out.npz")
@@ -127,7 +127,7 @@ def test_the_minutes_end_a_training_before_the_steps_do(tmp_path, buffer):
 def test_an_ended_peer_names_its_log_and_why(tmp_path, buffer):
     buffer.save(tmp_path / "episodes.npz")
     with (
-        pytest.raises(PeerError, match=r"tiny_worker has ended with code 1, see .*log: ValueError: no such layer"),
+        pytest.raises(BaselineError, match=r"tiny_worker has ended with code 1, see .*log: ValueError: no such layer"),
         tiny_process(tmp_path) as process,
     ):
         process.train(tmp_path / "episodes.npz", {"fail": "no such layer"}, 0, 50, None)
@@ -137,9 +137,9 @@ ENDLESS = """
 import sys
 from pathlib import Path
 sys.path.append("studies")
-from peers.process import PeerProcess
+from baselines.process import BaselineProcess
 folder = Path(sys.argv[1])
-with PeerProcess(Path(sys.executable), "tests.studies.tiny_worker", folder / "log") as process:
+with BaselineProcess(Path(sys.executable), "tests.studies.tiny_worker", folder / "log") as process:
     on_progress = lambda done, n_steps: print(done, flush=True)
     process.train(folder / "episodes.npz", {"learning_rate": 0.1}, 0, 10**9, None, on_progress)
 """
@@ -175,7 +175,7 @@ def test_a_finished_cell_is_a_row_and_is_not_run_again(tmp_path, datasets, buffe
     assert (row["settings"]["n_timesteps"], row["settings"]["minutes"]) == (20, 1.0)
     assert row["data"]["n_steps"] == len(buffer)
     assert row["action_ms"] > 0.0
-    assert "peer's numpy" in row["versions"]
+    assert "baseline's numpy" in row["versions"]
 
     # The same initial states as ours: an episode by hand, with the same actions.
     vec_env = make_seeded_envs("Pendulum-v1", cells.read_entries(datasets, cells.Data)["pendulum"].settings(), 1)
@@ -223,7 +223,7 @@ def test_a_search_changes_settings_and_names_its_rows(tmp_path, datasets, monkey
     assert (file.stem, row["label"]) == ("Pendulum-v1_1_linear_seed3_authors_pendulum-slow", "pendulum-slow")
     assert row["settings"]["d3rlpy"] == {"learning_rate": 0.1}
     assert row["settings"]["best_share"] == 0.4
-    assert PEERS["bc"].changed({"hidden": [8]}).settings["hidden"] == [512] * 3, "the other rows' settings stay"
+    assert OTHERS["bc"].changed({"hidden": [8]}).settings["hidden"] == [512] * 3, "the other rows' settings stay"
 
 
 @pytest.mark.slow
@@ -265,7 +265,7 @@ def test_a_failing_cell_leaves_no_row_and_does_not_stop_the_others(tmp_path, dat
         (("--steps", "0"), r"--steps: must be more than 0, got 0"),
         (("-params", "learning_rate:0.1"), r"-params: needs --label"),
         (("--label", "a", "-params", "rate:0.1"), r"-params: linear has no rate; it has best_share, learning_rate"),
-        (("--d3rlpy-python", "nowhere/python"), r"nowhere/python does not exist; `make peers` installs it"),
+        (("--d3rlpy-python", "nowhere/python"), r"nowhere/python does not exist; `make baselines` installs it"),
     ],
 )
 def test_a_mistake_is_named_before_anything_runs(tmp_path, datasets, arguments, message):
@@ -276,29 +276,29 @@ def test_a_mistake_is_named_before_anything_runs(tmp_path, datasets, arguments, 
 
 def test_a_dataset_that_is_missing_is_named_with_where_its_recipe_is(tmp_path, datasets):
     (tmp_path / "pendulum.npz").unlink()
-    with pytest.raises(UsageError, match=r"pendulum: .*pendulum.npz.* studies/peers.yml says how to record it"):
+    with pytest.raises(UsageError, match=r"pendulum: .*pendulum.npz.* studies/baselines.yml says how to record it"):
         command.main(command_line(tmp_path, datasets))
 
 
 def test_every_dataset_of_the_comparison_is_a_task_with_settings_for_us_and_for_its_peers():
-    for name, data in cells.read_entries(ROOT / "studies" / "peers.yml", cells.Data).items():
+    for name, data in cells.read_entries(ROOT / "studies" / "baselines.yml", cells.Data).items():
         assert data.kind in cells.KINDS, name
-        assert data.peers.keys() <= PEERS.keys(), name
+        assert data.baselines.keys() <= OTHERS.keys(), name
         assert data.settings()["env_wrapper"], name
         if data.task != "PushT-v0":
             gym.spec(data.task)
-    for peer in PEERS.values():
-        assert peer.worker in cells.WORKERS
-        assert {*peer.only, *peer.kinds} <= set(cells.KINDS)
-    assert not set(PEERS) & set(ALGORITHMS)
+    for baseline in OTHERS.values():
+        assert baseline.worker in cells.WORKERS
+        assert {*baseline.only, *baseline.kinds} <= set(cells.KINDS)
+    assert not set(OTHERS) & set(ALGORITHMS)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "kind"), SETTINGS)
 def test_a_peer_trains_and_acts(tmp_path, datasets, name, kind):
-    worker = PEERS[name].worker
+    worker = OTHERS[name].worker
     if not (python := PYTHONS[worker]).exists():
-        pytest.skip(f"{python} does not exist; `make peers` installs it")
+        pytest.skip(f"{python} does not exist; `make baselines` installs it")
     datasets.write_text(datasets.read_text().replace("kind: arm", f"kind: {kind}"))
     line = ["--datasets", str(datasets), "--algo", name, "--seeds", "0", "--steps", "12", "--n-eval-envs", "2"]
     line += ["--final-episodes", "3", "-o", str(tmp_path / "rows"), "-f", str(tmp_path), f"--{worker}-python", str(python)]
@@ -306,19 +306,19 @@ def test_a_peer_trains_and_acts(tmp_path, datasets, name, kind):
     (file,) = (tmp_path / "rows").glob("*.jsonl")
     (row,) = read_rows(file)
     assert (row["algo"], row["step"], row["lengths"]) == (name, 12, [200] * 3)
-    assert f"peer's {worker}" in row["versions"]
+    assert f"baseline's {worker}" in row["versions"]
 
 
 @pytest.mark.slow
 def test_d3rlpy_and_ours_read_the_same_of_a_file(tmp_path, buffer):
     """BC learns the map by heart that the episodes were made with, through scaling and standardising and back."""
     if not PYTHONS["d3rlpy"].exists():
-        pytest.skip("`make peers` installs d3rlpy")
+        pytest.skip("`make baselines` installs d3rlpy")
     buffer.save(tmp_path / "episodes.npz")
-    settings = PEERS["bc"].settings | {"hidden": [64, 64]}
+    settings = OTHERS["bc"].settings | {"hidden": [64, 64]}
     steps = load_dataset(tmp_path / "episodes.npz")
     observations, actions = (getattr(steps, name)[steps.rows].numpy() for name in ("observations", "actions"))
-    with PeerProcess(PYTHONS["d3rlpy"], cells.WORKERS["d3rlpy"], tmp_path / "log") as process:
+    with BaselineProcess(PYTHONS["d3rlpy"], cells.WORKERS["d3rlpy"], tmp_path / "log") as process:
         process.train(tmp_path / "episodes.npz", settings, 0, 500, None)
         n = len(observations)
         found, _ = process.predict({"observation": observations, "return_to_go": np.zeros((n, 1))}, None, np.ones(n, bool))
@@ -329,8 +329,8 @@ def test_the_picture_shows_all_rows(tmp_path, monkeypatch):
     drawn = []
     plot = Axes.plot
     monkeypatch.setattr(Axes, "plot", lambda self, x, y, *a, **k: drawn.extend(x) or plot(self, x, y, *a, **k))
-    figure.plot(ROOT / "results" / "baselines.csv", tmp_path / "peers.png")
-    assert (tmp_path / "peers.png").stat().st_size > 10_000
+    figure.plot(ROOT / "results" / "baselines.csv", tmp_path / "baselines.png")
+    assert (tmp_path / "baselines.png").stat().st_size > 10_000
     assert len(drawn) == len(list(table.long_table(ROOT / "results" / "baselines.csv"))) - 1  # but for the header
     assert min(drawn) >= 0
     assert max(drawn) == 1
@@ -340,13 +340,13 @@ def test_the_page_says_what_the_rows_say():
     header, *lines = table.long_table(ROOT / "results" / "baselines.csv")
     shown = [dict(zip(header, line, strict=True)) for line in lines]
     columns = ("data", "algorithm", "final", "minutes", "gradient steps", "ms an action")
-    page = (ROOT / "docs" / "studies" / "peers.md").read_text()
+    page = (ROOT / "docs" / "studies" / "baselines.md").read_text()
     assert "\n".join(f"| {' | '.join(row[each] for each in columns)} |" for row in shown) in page
 
 
 def test_the_page_shows_the_defaults_beside_the_other_libraries():
     header, *lines = table.suite_table(ROOT / "results" / "baselines.csv", ROOT / "results" / "suite.csv")
-    page = (ROOT / "docs" / "studies" / "peers.md").read_text()
+    page = (ROOT / "docs" / "studies" / "baselines.md").read_text()
     assert len(lines) >= 8
     for line in (header, *lines):
         assert f"\n| {' | '.join(line)} |" in page

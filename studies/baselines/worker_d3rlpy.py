@@ -1,4 +1,4 @@
-"""d3rlpy's algorithms as peers; runs in an environment of their own (`make peers`)."""
+"""d3rlpy's algorithms as baselines; runs in an environment of their own (`make baselines`)."""
 
 import dataclasses
 from collections.abc import Callable
@@ -8,7 +8,7 @@ import d3rlpy
 import numpy as np
 import torch as th
 
-from peers.protocol import Dataset, serve
+from baselines.protocol import Dataset, serve
 
 CONFIGS = {
     "bc": d3rlpy.algos.BCConfig,
@@ -57,7 +57,7 @@ class D3rlpyLearner:
         )
 
     def learn(self, n_steps: int, after_step: Callable[[], None]) -> None:
-        """See :class:`~peers.protocol.Learner`."""
+        """See :class:`~baselines.protocol.Learner`."""
         self.algorithm.fit(
             self._episodes,
             n_steps=n_steps,
@@ -68,7 +68,7 @@ class D3rlpyLearner:
         )
 
     def actor(self) -> Callable[[np.ndarray, float, bool], np.ndarray]:
-        """See :class:`~peers.protocol.Learner`."""
+        """See :class:`~baselines.protocol.Learner`."""
         if hasattr(self.algorithm, "as_stateful_wrapper"):
             return _ReturnConditioned(self.algorithm)
         return lambda observation, return_to_go, start: self.algorithm.predict(observation[None])[0]

@@ -1,4 +1,4 @@
-"""robomimic's BC-RNN-GMM as a peer; runs in an environment of its own (`make peers`)."""
+"""robomimic's BC-RNN-GMM as a baseline; runs in an environment of its own (`make baselines`)."""
 
 import copy
 import tempfile
@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import torch as th
 
-from peers.protocol import Dataset, serve
+from baselines.protocol import Dataset, serve
 
 # robomimic imports torchvision, for images, which ours has none of. PyPI's is built for GPUs: beside a PyTorch for CPUs it
 # misses its own operators, and that they are known by name is enough for its import.
@@ -64,7 +64,7 @@ class RobomimicLearner:
         self._batches = th.utils.data.DataLoader(steps, batch_size=settings["batch_size"], shuffle=True)
 
     def learn(self, n_steps: int, after_step: Callable[[], None]) -> None:
-        """See :class:`~peers.protocol.Learner`."""
+        """See :class:`~baselines.protocol.Learner`."""
         done = 0
         while done < n_steps:
             for batch in self._batches:
@@ -78,7 +78,7 @@ class RobomimicLearner:
                     return
 
     def actor(self) -> Callable[[np.ndarray, float, bool], np.ndarray]:
-        """See :class:`~peers.protocol.Learner`; each has a hidden state of its own beside the same networks."""
+        """See :class:`~baselines.protocol.Learner`; each has a hidden state of its own beside the same networks."""
         algorithm = copy.copy(self.algorithm)
 
         def act(observation: np.ndarray, return_to_go: float, start: bool) -> np.ndarray:
