@@ -202,11 +202,12 @@ def understand(words: list[str]) -> None:
         assert options.training_script == "sb3_dtfm"
         understand(["sb3-dtfm", *options.training_script_args])
     elif program == "python":
-        script = ROOT / arguments[0]
+        is_module = arguments[0] == "-m"
+        path = f"studies/{arguments[1].replace('.', '/')}.py" if is_module else arguments[0]
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(sys, "argv", arguments)
-            patch.syspath_prepend(str(script.parent))
-            parse_only(lambda: runpy.run_path(str(script), run_name="__main__"))
+            patch.setattr(sys, "argv", arguments[is_module:])
+            patch.syspath_prepend(str(ROOT / "studies" if is_module else (ROOT / path).parent))
+            parse_only(lambda: runpy.run_path(str(ROOT / path), run_name="__main__"))
     elif program == "make":
         makefile = (ROOT / "Makefile").read_text()
         targets = re.findall(r"^\.PHONY: (.*)$", makefile, re.MULTILINE)[0].split()
@@ -214,14 +215,14 @@ def understand(words: list[str]) -> None:
         for name, _, value in (word.partition("=") for word in arguments if "=" in word):
             assert f"$({name})" in makefile
             if name == "ARGUMENTS":
-                understand_peers(value)
+                understand_baselines(value)
     else:
         assert words[:4] == ["pip", "install", "-c", "constraints.txt"], f"{program}: no command that this test knows"
         extras = {extra for word in words for extra in re.findall(r"^\.\[(.*)\]$", word)}
         assert extras <= set(metadata("sb3-dtfm").get_all("Provides-Extra"))
 
 
-def understand_peers(arguments: str) -> None:
+def understand_baselines(arguments: str) -> None:
     """What `make baselines` passes on."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(ROOT / "studies"))

@@ -1,4 +1,4 @@
-"""What `make baselines` is to run: its data and its baselines, from their YAML files, and a row for each baseline's training."""
+"""The data and algorithms of `make baselines`, from their YAML files, and a row for each training."""
 
 import argparse
 import contextlib

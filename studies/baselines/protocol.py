@@ -1,5 +1,5 @@
 """
-What a baseline's process and ours say to each other, and what every baseline needs: NumPy alone, as its environment lacks sb3_dtfm.
+Messages between a baseline's process and ours. Baselines need NumPy alone: their environment lacks sb3_dtfm.
 
 A message is a line of JSON, which names the arrays after it with their types and shapes, and the bytes of these arrays.
 """

@@ -83,7 +83,7 @@ def test_a_message_arrives_as_it_was_sent():
 
 @pytest.mark.filterwarnings("ignore:.*max_episode_steps")
 @pytest.mark.parametrize(("fraction", "best_share", "limit"), [(1.0, None, None), (0.6, None, 8), (1.0, 0.4, 9)])
-def test_a_peer_is_given_the_steps_that_ours_learn_from(datasets, buffer, tmp_path, fraction, best_share, limit):
+def test_a_baseline_is_given_the_steps_that_ours_learn_from(datasets, buffer, tmp_path, fraction, best_share, limit):
     data = cells.read_entries(datasets, cells.Data)["pendulum"]._replace(fraction=fraction)
     cells.export(data, cells.Baseline("any", "d3rlpy", 1, {}, best_share=best_share), tmp_path / "out.npz", limit)
     expected = load_dataset(buffer, max_episode_steps=limit).random_fraction(fraction, seed=0)
@@ -99,7 +99,7 @@ def test_a_peer_is_given_the_steps_that_ours_learn_from(datasets, buffer, tmp_pa
     np.testing.assert_allclose(given.to_environment(scaled), expected.actions[expected.rows].numpy(), atol=1e-6)
 
 
-def test_a_peer_learns_and_acts_in_the_range_of_the_environment(tmp_path, buffer):
+def test_a_baseline_learns_and_acts_in_the_range_of_the_environment(tmp_path, buffer):
     buffer.save(tmp_path / "episodes.npz")
     observations = np.random.default_rng(1).uniform(-1, 1, (3, 3)).astype(np.float32)
     with tiny_process(tmp_path) as process:
@@ -124,7 +124,7 @@ def test_the_minutes_end_a_training_before_the_steps_do(tmp_path, buffer):
     assert training.processor_seconds < 2.0
 
 
-def test_an_ended_peer_names_its_log_and_why(tmp_path, buffer):
+def test_an_ended_baseline_names_its_log_and_why(tmp_path, buffer):
     buffer.save(tmp_path / "episodes.npz")
     with (
         pytest.raises(BaselineError, match=r"tiny_worker has ended with code 1, see .*log: ValueError: no such layer"),
@@ -145,7 +145,7 @@ with BaselineProcess(Path(sys.executable), "tests.studies.tiny_worker", folder /
 """
 
 
-def test_a_killed_command_takes_its_peer_along(tmp_path, buffer):
+def test_a_killed_command_takes_its_baseline_along(tmp_path, buffer):
     buffer.save(tmp_path / "episodes.npz")
     with subprocess.Popen([sys.executable, "-c", ENDLESS, str(tmp_path)], stdout=subprocess.PIPE) as process:
         assert int(process.stdout.readline()) > 0, "it is training"
@@ -280,7 +280,7 @@ def test_a_dataset_that_is_missing_is_named_with_where_its_recipe_is(tmp_path, d
         command.main(command_line(tmp_path, datasets))
 
 
-def test_every_dataset_of_the_comparison_is_a_task_with_settings_for_us_and_for_its_peers():
+def test_every_dataset_of_the_comparison_is_a_task_with_settings_for_us_and_for_its_baselines():
     for name, data in cells.read_entries(ROOT / "studies" / "baselines.yml", cells.Data).items():
         assert data.kind in cells.KINDS, name
         assert data.baselines.keys() <= OTHERS.keys(), name
