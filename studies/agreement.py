@@ -25,7 +25,7 @@ from sb3_dtfm.data import TrajectoryBuffer, load_dataset
 from sb3_dtfm.recording.loading import algorithm_of, load_agent
 
 N_WINDOWS = 4096
-# So long do the locomotion tasks' agents take to find their gait.
+# Locomotion policies need so many steps until they walk steadily.
 N_FIRST_STEPS = 40
 
 

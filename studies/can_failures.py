@@ -3,7 +3,7 @@ Where trained models' attempts at Can end that fail: what to look at before a cu
 
     python studies/can_failures.py logs/dtfm/robosuite-Can-v0_1/robosuite-Can-v0.zip ...
 
-Plays the first hundred final episodes of `sb3-dtfm benchmark`, and sorts them by what is seen and done: whether the can was
+Plays the first hundred final episodes of `sb3-dtfm benchmark`, and sorts them by what happened: whether the can was
 lifted at all, and where the hand first opened afterwards. Where it let go on the way, 64 other draws of a DTFM at that
 decision tell whether chance decided: printed is the share of them that lets go, too.
 """

@@ -19,8 +19,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 from deploy import Policy
 
 # Name: algorithm, width, layers, width of the flow head, tokens a step, context.
-SMALL = ("small profile", 128, 3, 128, 1, 5)
-PAPER = ("paper profile", 256, 10, 512, 3, 20)
+SMALL = ("width 128", 128, 3, 128, 1, 5)
+PAPER = ("paper's size", 256, 10, 512, 3, 20)
 FEW, MANY, ONE = {"flow_steps": 3}, {"flow_steps": 50}, {"flow_solver": "one_step"}
 WAYS = [
     (SMALL, "dt", {}),

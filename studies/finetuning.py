@@ -3,15 +3,15 @@ What fine-tuning brought: runs of `sb3-dtfm finetune` as rows, and their curves.
 
     python studies/finetuning.py measure logs/dtfm/robosuite-Can-v0_2 --before logs/dtfm/robosuite-Can-v0_1 \\
         --like mine/robosuite-Can-v0_0.05_dtfm_seed0_small.jsonl --label own-episodes --output mine
-    python studies/finetuning.py plot results/finetuning.csv --task HalfCheetah-v5 --labels steered sac sac-with-data \\
+    python studies/finetuning.py plot results/finetuning.csv --task HalfCheetah-v5 --labels noise-space sac sac-with-data \\
         --output docs/studies/finetuning.png
-    python studies/finetuning.py attempts results/rollouts.csv --output docs/studies/attempts.png
+    python studies/finetuning.py rollouts results/rollouts.csv --output docs/studies/rollouts.png
 
 `measure` plays 100 final episodes, as `sb3-dtfm benchmark` does, with the model before (rows of the label "before"), with
 the last one after, and with the best of its evaluations (rows of the label with "-best"), and takes the curve from the run's
 evaluations.npz. Its steps are the environments', its seconds those until then, evaluations included. `--like` is the cell of
 the model before: its rows tell task, data and seed. Final episodes are played in the environments of the run's evaluations.
-`attempts` shows models that learned from more or fewer attempts, each label so many, by how many steps of the environment
+`rollouts` shows models that learned from more or fewer rollouts, each label so many, by how many steps of the environment
 these took, each task beside the others.
 """
 
@@ -126,7 +126,7 @@ def plot(folder: Path, task: str, labels: list[str], output: Path) -> None:
 
     :param folder: of rows
     :param task: to show
-    :param labels: likewise
+    :param labels: of the rows to show
     :param output: the PNG
     """
     groups = {group.label: group for study in read_studies([folder]) for group in study.groups}
@@ -148,28 +148,28 @@ def plot(folder: Path, task: str, labels: list[str], output: Path) -> None:
     figure.savefig(output, dpi=110)
 
 
-def plot_attempts(folder: Path) -> Figure:
+def plot_rollouts(folder: Path) -> Figure:
     """
-    Share of final episodes that the seeds solve by what was attempted for them, its mean with a 95 % interval (Student's t).
+    Share of final episodes that the seeds solve by the rollouts that they learned from, its mean with a 95 % interval (Student's t).
 
     :param folder: of rows, whose tasks are shown side by side
     """
     tasks = sorted({task for study in read_studies([folder]) for group in study.groups for task, _, _ in group.runs})
     figure, fields = new_figure(len(tasks))
     for axes, task in zip(fields, tasks, strict=True):
-        draw_curve(axes, *by_attempted_steps(folder, task), "C0", marker="o")
-        axes.set(title=task, xlabel="thousand environment steps of all attempts")
+        draw_curve(axes, *by_rollout_steps(folder, task), "C0", marker="o")
+        axes.set(title=task, xlabel="thousand environment steps of all rollouts")
         axes.xaxis.set_major_formatter(lambda steps, _: f"{steps / 1000:g}")
     fields[0].set_ylim(top=100)
     fields[0].set_ylabel("solved, %")
     return figure
 
 
-def by_attempted_steps(folder: Path, task: str) -> tuple[np.ndarray, np.ndarray]:
+def by_rollout_steps(folder: Path, task: str) -> tuple[np.ndarray, np.ndarray]:
     """
-    :param folder: of rows; each label has learned from so many attempts beside the same demonstrations, one from none
+    :param folder: of rows; each label has learned from so many rollouts beside the same demonstrations, one from none
     :param task: to look at
-    :return: how many steps the attempts of a seed have on average, (N,) from 0 on, and what each seed's final episodes came
+    :return: how many steps the rollouts of a seed have on average, (N,) from 0 on, and what each seed's final episodes came
         to, (seeds, N)
     """
     groups = [runs_of(group, task) for study in read_studies([folder]) for group in study.groups]
@@ -227,14 +227,14 @@ def main() -> None:
     plotting("--task", required=True)
     plotting("--labels", nargs="+", required=True)
     plotting("--output", type=Path, required=True)
-    attempting = commands.add_parser("attempts").add_argument
-    attempting("folder", type=Path)
-    attempting("--output", type=Path, required=True)
+    rolling = commands.add_parser("rollouts").add_argument
+    rolling("folder", type=Path)
+    rolling("--output", type=Path, required=True)
     options = parser.parse_args()
     if options.command == "plot":
         plot(options.folder, options.task, options.labels, options.output)
-    elif options.command == "attempts":
-        plot_attempts(options.folder).savefig(options.output, dpi=110)
+    elif options.command == "rollouts":
+        plot_rollouts(options.folder).savefig(options.output, dpi=110)
     else:
         options.output.mkdir(parents=True, exist_ok=True)
         measure(options.run, options.before, read_rows(options.like)[-1], options.label, options.output)

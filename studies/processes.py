@@ -3,7 +3,7 @@ How many gradient steps a second one process makes with a thread and with two, a
 
     python studies/processes.py --dataset local/halfcheetah/expert-v0
 
-By `sb3-dtfm train`, in turn, all with 64 windows a step: the small profile of HalfCheetah, and the paper's trunk and head.
+By `sb3-dtfm train`, in turn, all with 64 windows a step: a small network of width 128, and the paper's trunk and head.
 Prints a row for each size: the rates of all rounds.
 """
 
@@ -19,7 +19,7 @@ RATE = re.compile(r"steps_per_second\s*\|\s*([\d.]+)")
 TRAINING = ["train", "--algo", "dtfm", "--env", "HalfCheetah-v5", "--eval-freq", "-1"]
 # Of each size, the gradient steps of a run and what `sb3-dtfm train` is told beside them.
 SIZES = {
-    "small profile": (300, []),
+    "width 128": (300, []),
     "paper's size": (
         12,
         ["-params", "context_length:20", "policy_kwargs:dict(embed_dim=256, n_layers=10, flow_hidden_dim=512)"],

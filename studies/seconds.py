@@ -182,7 +182,7 @@ def run_baseline(job: Job, baseline: Baseline, python: Path, log: Path) -> Cell:
 def kind(job: Job) -> str:
     """What the authors of baselines change their settings by."""
     task = job.task.env_id
-    return "arm" if task.startswith("robosuite") else "hand" if task.startswith("AdroitHand") else "gait"
+    return "manipulation" if task.startswith("robosuite") else "hand" if task.startswith("AdroitHand") else "locomotion"
 
 
 def planned(options: argparse.Namespace, data: str, algo: str, seed: int) -> list[Job]:

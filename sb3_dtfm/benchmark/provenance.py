@@ -100,7 +100,7 @@ def describe_data(buffer: TrajectoryBuffer, dataset: str, recorded_from: str | N
     :param recorded_from: the agent or demonstrator, read from the dataset's metadata if not given
     :return: dataset (a file without its folder), recorded_from, n_episodes, n_steps; mean_return and success_rate of the
         episodes, best_return and best_success of the best tenth of them; best_return is the mean of all where the start
-        decides, as the best had the luckiest starts. Success, in [0, 1], is None where the data do not tell
+        decides, as the best had the easiest starts. Success, in [0, 1], is None where the data do not tell
     """
     reference, best = return_reference(buffer), buffer.best(best_share=BEST_SHARE)
     best_success = float(best.successes.mean())

@@ -31,7 +31,7 @@ CLONING = {"n_timesteps": 5000, "batch_size": 256, "learning_rate": 1e-3, "hidde
 
 class Task(NamedTuple):
     """
-    What is asked for one task beside the profile: an entry of the file of `--datasets`.
+    What a user asks for one task beside the profile: an entry of the file of `--datasets`.
 
     :param name: of the task with its data, by which rows and reports know it
     :param dataset: Minari id, robomimic file or flat arrays, None for the profile's

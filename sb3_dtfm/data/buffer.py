@@ -184,9 +184,9 @@ class TrajectoryBuffer(FlatSteps):
 
     def with_expected_returns(self, n_steps: int, seed: int) -> "TrajectoryBuffer":
         """
-        A buffer whose returns-to-go are hardly luck: what came after n steps is replaced by what may be expected after such
-        an observation, an expectile of 0.95 (conditioning on expected returns: Paster et al., 2022). Without that, asking
-        for the best return asks for what the luckiest did. Returns of episodes, and what draws them, stay what was recorded.
+        A buffer whose returns-to-go hardly depend on chance: the rewards after n steps are replaced by the return that may
+        be expected after such an observation, an expectile of 0.95 (conditioning on expected returns: Paster et al.,
+        2022). Without that, a high target return stands for lucky episodes. Returns of episodes, and what draws them, stay what was recorded.
         See :func:`~sb3_dtfm.data.expected.expected_returns_to_go`.
 
         :param n_steps: n, steps whose rewards count as they came

@@ -95,8 +95,8 @@ def moments(observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     sums, squares = _power_sums(observations)
     mean = sums / len(observations)
     deviations = squares - mean * sums
-    # A spread that is small beside the mean drowns in the rounding of this difference, and a constant dimension would seem
-    # to have one: sums from the first row on tell.
+    # Rounding hides a deviation that is small beside the mean, and gives a constant dimension one. Sums of differences
+    # from the first row do not.
     close = np.flatnonzero(deviations < CANCELLATION * squares)
     if len(close):
         first = observations[0, close].astype(np.float64)

@@ -75,7 +75,7 @@ def inspect_buffer(buffer: TrajectoryBuffer) -> Inspection:
 def suggested_target_return(buffer: TrajectoryBuffer) -> float:
     """
     A return to ask for: the mean of the best tenth of the episodes; of all episodes where the start decides their returns,
-    since the best tenth had the luckiest starts then.
+    since the best tenth had the easiest starts then.
 
     :param buffer: as it would be learned from
     :return: environment reward units, four digits
@@ -156,7 +156,7 @@ def _of_episodes(buffer: TrajectoryBuffer) -> list[str]:
     explained = explained_by_start(buffer)
     if explained >= START_DECIDES:
         start = f"Returns depend on how an episode starts ({100 * explained:.0f} % of their variance)"
-        remarks.append(f"{start}: asking for the best asks for the luckiest start.")
+        remarks.append(f"{start}: the best returns come from the easiest starts.")
     return remarks
 
 

@@ -154,7 +154,7 @@ class ReturnReference(NamedTuple):
 
     @property
     def suggested(self) -> float:
-        """The target return that the data suggest: the best tenth's, or the mean where these had the luckiest starts."""
+        """The target return that the data suggest: the best tenth's, or the mean where these had the easiest starts."""
         return self.recorded if self.start_decides else self.best_tenth
 
     def goal(self, target_return: float | None) -> tuple[float, str]:

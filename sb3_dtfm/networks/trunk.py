@@ -124,7 +124,7 @@ class SequenceTrunk(nn.Module):
     third of the products, a ninth of the attention. The hidden state of step t is read at its observation's token: it has
     seen return-to-go and observation of t and everything before them, and not the action of t.
 
-    The action before the oldest step of a window is out of sight: no token of three, no summand of one.
+    The action before the oldest step of a window is left out: no token of three, no summand of one.
 
     Without `timestep_embedding` the order of tokens shows in the causal mask alone (Kazemnejad et al., 2023), and nothing
     is learned that holds for one time step only.
@@ -138,8 +138,8 @@ class SequenceTrunk(nn.Module):
     :param dropout: probability on embeddings, attention weights and residual branches
     :param timestep_embedding: add the embeddings of time steps
     :param tokens_per_step: 3 or 1
-    :param film_return_to_go: scale and shift the tokens before each block by the return-to-go of their step. Added to a
-        token, what is asked for soon drowns in what is seen; a factor decides what the rest is read as
+    :param film_return_to_go: scale and shift the tokens before each block by the return-to-go of their step, so that
+        observations do not outweigh the target return
     """
 
     def __init__(

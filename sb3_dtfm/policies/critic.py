@@ -31,7 +31,7 @@ class Critic(nn.Module):
     :param observation_dim: O
     :param action_dim: h A, of all actions that are valued together
     :param hidden_dim: width of two hidden layers
-    :param expectile: in (0.5, 1): 0.5 values the data's policy, near 1 the best of its actions, and luck with them
+    :param expectile: in (0.5, 1): 0.5 values the data's policy, near 1 the best of its actions, and noise with them
     """
 
     batch_size = 256

@@ -67,8 +67,8 @@ class SequencePolicy(ActingPolicy):
 
     `deterministic=True` starts from noise that belongs to the time step and the episode: rows of a table that is drawn once
     from `seed` and saved with the model, from a row on that the episode's first observation decides. Zero noise would be one
-    point of the distribution, and following the same mode for ever gets an arm stuck; the same rows in every episode would
-    give all of them the same luck.
+    point of the distribution, and following the same mode for ever gets a robot arm stuck. The same rows in every episode
+    would correlate the episodes.
 
     :param observation_space: Dict of `observation` (O,), `return_to_go` (1,) and `timestep` (1,)
     :param action_space: bounded Box (A,); or Discrete, whose actions are vectors for all but `predict`, see

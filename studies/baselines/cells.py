@@ -21,7 +21,7 @@ from sb3_dtfm.zoo.arguments import UsageError
 
 HERE = Path(__file__).parent
 PROFILE = "authors"  # what the rows call the baselines' settings
-KINDS = ("gait", "hand", "arm")
+KINDS = ("locomotion", "hand", "manipulation")
 # Name: the module that its environment runs.
 WORKERS = {"d3rlpy": "baselines.worker_d3rlpy", "robomimic": "baselines.worker_robomimic"}
 

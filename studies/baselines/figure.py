@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from baselines.table import Cells, read
 
 # Ours in colours of their own, the others in grey shapes.
-OURS = {"dt": ("DT", "D", "C1"), "dtfm": ("DTFM", "o", "C0"), "dtfm, guided": ("DTFM, best-of-N", "*", "C3")}
+OURS = {"dt": ("DT", "D", "C1"), "dtfm": ("DTFM", "o", "C0"), "dtfm, best-of-n": ("DTFM, best-of-N", "*", "C3")}
 OTHERS = {
     "d3rlpy-dt": ("d3rlpy's DT", "s"),
     "bc": ("BC", "v"),

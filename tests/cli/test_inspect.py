@@ -70,7 +70,7 @@ def test_where_the_start_decides_the_command_asks_for_the_mean(workplace, capsys
     assert main(["inspect", "starts.npz"]) == 0
     text = capsys.readouterr().out
     assert "- Returns depend on how an episode starts (9" in text
-    assert "% of their variance): asking for the best asks for the luckiest start.\n" in text
+    assert "% of their variance): the best returns come from the easiest starts.\n" in text
     assert "--target-return 14.5\n" in text
 
 

@@ -115,7 +115,7 @@ def with_critic(buffer: TrajectoryBuffer, **policy_kwargs) -> DTFM:
 
 
 def went_right(model: DTFM, deterministic: bool = True) -> float:
-    """Share of 200 starts; what is asked for is what both ways have in the middle."""
+    """Share of 200 starts; the target return is the mean of both ways."""
     random = np.random.default_rng(1)
     observations = {
         "observation": random.normal(size=(200, 3)).astype(np.float32),

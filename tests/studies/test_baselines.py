@@ -56,7 +56,7 @@ def datasets(tmp_path, buffer) -> Path:
     """A file like studies/baselines.yml, of one dataset."""
     buffer.save(tmp_path / "pendulum.npz")
     (tmp_path / "baselines.yml").write_text(
-        f"pendulum: {{task: Pendulum-v1, kind: arm, dataset: {tmp_path / 'pendulum.npz'}, target_return: 0, minutes: 1}}\n"
+        f"pendulum: {{task: Pendulum-v1, kind: manipulation, dataset: {tmp_path / 'pendulum.npz'}, target_return: 0, minutes: 1}}\n"
     )
     return tmp_path / "baselines.yml"
 
@@ -299,7 +299,7 @@ def test_a_peer_trains_and_acts(tmp_path, datasets, name, kind):
     worker = OTHERS[name].worker
     if not (python := PYTHONS[worker]).exists():
         pytest.skip(f"{python} does not exist; `make baselines` installs it")
-    datasets.write_text(datasets.read_text().replace("kind: arm", f"kind: {kind}"))
+    datasets.write_text(datasets.read_text().replace("kind: manipulation", f"kind: {kind}"))
     line = ["--datasets", str(datasets), "--algo", name, "--seeds", "0", "--steps", "12", "--n-eval-envs", "2"]
     line += ["--final-episodes", "3", "-o", str(tmp_path / "rows"), "-f", str(tmp_path), f"--{worker}-python", str(python)]
     command.main(line)

@@ -37,7 +37,7 @@ def test_a_run_is_measured_and_shown(workplace):
     with np.load(run / "evaluations.npz") as evaluations:
         means = evaluations["results"].mean(axis=1)
         assert best.final["step"] == evaluations["timesteps"][means.argmax()]
-    assert before.final["mean_length"] == after.final["mean_length"] == 22  # as in evaluations, longer than attempts
+    assert before.final["mean_length"] == after.final["mean_length"] == 22  # as in evaluations, longer than rollouts
     assert after.final["settings"]["env_kwargs"] == {"max_episode_steps": 20}
     assert before.final["mean_return"] != after.final["mean_return"]
     assert after.final["settings"]["gradient_steps"] == 2
@@ -78,7 +78,7 @@ def test_a_noise_space_run_is_measured_where_its_decisions_are_steps(workplace):
         finetuning.measure(finetuned / "HalfCheetah-v5_2", before, like, "finetuned", workplace / "rows")
 
 
-def test_attempts_are_shown_by_the_steps_they_took(tmp_path, monkeypatch):
+def test_rollouts_are_shown_by_the_steps_they_took(tmp_path, monkeypatch):
     like = make_row()
     lift = {("Lift", 0, "many", 50): 2, ("Lift", 1, "many", 54): 4, ("Lift", 0, "none", 10): 1, ("Lift", 1, "none", 10): 0}
     can = {("Can", 0, "none", 10): 3, ("Can", 1, "none", 10): 1, ("Can", 0, "many", 30): 3, ("Can", 1, "many", 30): 4}
@@ -87,13 +87,13 @@ def test_attempts_are_shown_by_the_steps_they_took(tmp_path, monkeypatch):
         row.update(data={**like["data"], "n_steps": n_steps}, returns=[0.0] * 4, lengths=[9] * 4)
         row["successes"] = [True] * n + [False] * (4 - n)
         write_row(tmp_path / f"{Cell.of(row).file_name}.jsonl", row)
-    shown = {axes.get_title(): axes for axes in finetuning.plot_attempts(tmp_path).axes}
+    shown = {axes.get_title(): axes for axes in finetuning.plot_rollouts(tmp_path).axes}
     assert [line.get_ydata().tolist() for line in shown["Lift"].lines] == [[25, 50], [0, 100], [12.5, 75]]
     assert [line.get_ydata().tolist() for line in shown["Can"].lines] == [[75, 75], [25, 100], [50, 87.5]]
     assert {tuple(line.get_xdata()) for line in shown["Lift"].lines} == {(0, 42)}, "on average"
     assert {tuple(line.get_xdata()) for line in shown["Can"].lines} == {(0, 20)}
-    monkeypatch.setattr("sys.argv", ["finetuning.py", "attempts", str(tmp_path), "--output", str(tmp_path / "attempts.png")])
+    monkeypatch.setattr("sys.argv", ["finetuning.py", "rollouts", str(tmp_path), "--output", str(tmp_path / "rollouts.png")])
     finetuning.main()
-    assert (tmp_path / "attempts.png").is_file()
+    assert (tmp_path / "rollouts.png").is_file()
     with pytest.raises(SystemExit, match="rows of Square with the same seeds"):
-        finetuning.by_attempted_steps(tmp_path, "Square")
+        finetuning.by_rollout_steps(tmp_path, "Square")

@@ -193,8 +193,8 @@ def _digits(value: float) -> int:
 
 def _intervals(group: Group) -> list[str]:
     text = (
-        "95 % intervals. Late average: Student's t over seeds. Final evaluation: likewise; of success the wider one "
-        "of that and Wilson's over the episodes of all seeds."
+        "95 % intervals. Late average: Student's t over seeds. Final evaluation: Student's t over seeds; of success the "
+        "wider one of that and Wilson's over the episodes of all seeds."
     )
     columns = {MEASURES["late"]: _late, MEASURES["final"]: _final}
     return [text, "", *_cell_table(group, group.tasks, columns)]
