@@ -29,7 +29,7 @@ help:
 	@echo "make docs     the report of results/suite.csv as docs/report.md, and the site, into build/site"
 	@echo "make dist     source distribution and wheel, into dist/; for PyPI with ADDRESS=https://github.com/OWNER/sb3_dtfm"
 	@echo "make format   rewrite the sources in the project's format"
-	@echo "make lint     check format and style"
+	@echo "make lint     check format, style and the sizes of docs and results"
 	@echo "make type     check types"
 	@echo "make clean    remove $(VENV), builds and caches"
 
@@ -63,7 +63,7 @@ demo: install
 	$(BIN)/sb3-dtfm demo
 
 test: install
-	$(BIN)/python -m pytest -n 2 --durations=10
+	$(BIN)/python -m pytest -n 2 --dist loadfile --durations=10
 
 test-all: install
 	$(BIN)/python -m pytest -n 2 --maxschedchunk 1 --durations=20 -m "slow or not slow"
@@ -136,6 +136,7 @@ format: install
 lint: install
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/python docs/limits.py
 
 type: install linked
 	cd build/linked && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache

@@ -95,9 +95,9 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
     :param return_weighting: w: of mixed data, a step of the best episode is learned from 1 + w times as often as one of the
         worst, and others by their returns in between (Yue et al., 2022); 0 learns from all alike. By default 5 where
         returns tell how episodes act, and 0 elsewhere
-    :param expected_return_steps: n: a step's return-to-go is the rewards of n steps and what may be expected after such an
-        observation, so that a high target return does not stand for a lucky start or lucky noise (Paster et al., 2022); 0 takes what was recorded. By
-        default 50 where returns tell how episodes act and no number makes up half of the rewards, and 0 elsewhere
+    :param expected_return_steps: n: a step's return-to-go is the rewards of n steps and the return expected after such an
+        observation, so that a high target return does not stand for chance (Paster et al., 2022); 0 takes the recorded
+        one. By default 50 where returns tell how episodes act and no number makes up half of the rewards, and 0 elsewhere
     :param dataset_kwargs: further arguments of :func:`~sb3_dtfm.data.load_dataset`: `{"cache_dir": folder}` for datasets
         larger than memory, `{"env_id": id}` for data that were recorded under another environment's name, and the
         reader's own, for example `{"filter_key": "train"}` for robomimic. `max_episode_steps` is the environment's unless

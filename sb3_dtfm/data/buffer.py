@@ -186,8 +186,8 @@ class TrajectoryBuffer(FlatSteps):
         """
         A buffer whose returns-to-go hardly depend on chance: the rewards after n steps are replaced by the return that may
         be expected after such an observation, an expectile of 0.95 (conditioning on expected returns: Paster et al.,
-        2022). Without that, a high target return stands for lucky episodes. Returns of episodes, and what draws them, stay what was recorded.
-        See :func:`~sb3_dtfm.data.expected.expected_returns_to_go`.
+        2022). Without that, a high target return stands for chance. Returns of episodes, by which steps are drawn, stay as
+        they were recorded. See :func:`~sb3_dtfm.data.expected.expected_returns_to_go`.
 
         :param n_steps: n, steps whose rewards count as they came
         :param seed: of the network that learns what to expect; the same one gives the same numbers

@@ -12,9 +12,9 @@ CHUNK_SIZE = 8
 # Euler steps of the flow for such demonstrations; for other data the mean action acts.
 FLOW_STEPS = 10
 # w: a step of the best episode is learned from 1 + w times as often as one of the worst.
-RETURN_WEIGHT = 5.0
+RETURN_WEIGHTING = 5.0
 # Steps after which a return-to-go counts what may be expected instead of what was recorded.
-RETURN_STEPS = 50
+EXPECTED_RETURN_STEPS = 50
 # Standard errors by which knowing an episode's return has to make actions more predictable.
 SIGNIFICANT = 2.0
 # Recorded steps below which batches are small.
@@ -96,7 +96,7 @@ def _by_return(errors: PredictionErrors | None) -> list[Decision]:
     reason = f"An episode's return {verb} how it acts (knowing it predicts held-out actions {t:.1f} standard errors better)."
     return [
         Decision("return_conditioning", tells, reason),
-        Decision("return_weighting", RETURN_WEIGHT if tells else 0.0, reason),
+        Decision("return_weighting", RETURN_WEIGHTING if tells else 0.0, reason),
     ]
 
 
@@ -115,7 +115,7 @@ def _by_reward(buffer: TrajectoryBuffer) -> list[Decision]:
     varies = 2 * n_equal < len(rewards)
     reason = f"{n_equal / len(rewards):.0%} of the rewards are one number (half or more if they tell of success alone)."
     return [
-        Decision("expected_return_steps", RETURN_STEPS if varies else 0, reason),
+        Decision("expected_return_steps", EXPECTED_RETURN_STEPS if varies else 0, reason),
         Decision("return_range", varies, reason),
     ]
 

@@ -72,7 +72,7 @@ def _regression(steps: Steps, statistics: Statistics, seed: int) -> th.Tensor:
     elapsed = steps.timesteps.unsqueeze(1) / (int(steps.timesteps.max()) + 1)
 
     def expected(chosen: th.Tensor) -> th.Tensor:
-        """Two numbers by observation and time: a return, and one that shrinks with the steps that are left, as a locomotion policy's."""
+        """A return by observation and time, and one that shrinks with the steps that are left, as of locomotion."""
         observations = statistics.normalize(steps.observations.index_select(0, steps.rows[chosen]))
         fixed, shrinking = network(th.cat((observations, elapsed[chosen]), dim=1)).unbind(1)
         return fixed + shrinking * (1.0 - elapsed[chosen, 0])

@@ -64,8 +64,8 @@ class FlowHead(ActionHead):
     matching from a hidden state that it gives no gradient. `flow_steps=0` then acts with tanh(W h + b), the mean action.
     By the flow's loss alone the trunk learns the mean more slowly.
 
-    With `one_step_policy` a second network learns where `flow_steps` of Euler end, 16 at most, so that an action can take one
-    evaluation instead of one per solver step. It learns from the field and gives nothing back: trunk and field are what they
+    With `one_step_policy` a second network learns where `flow_steps` of Euler end, 16 at most, so that an action can take
+    one evaluation instead of one per solver step. It learns from the field and gives nothing back: trunk and field are what they
     are without it. Where the field predicts actions, this network adds to the same W h + b, and starts at zero too; else it
     adds to the noise.
 

@@ -107,7 +107,7 @@ def test_a_run_that_is_interrupted_is_saved_at_once(run, workplace, capsys, monk
 
 
 def test_a_model_that_acts_by_its_mean_action_draws_in_noise_space(run, workplace, capsys):
-    """As gaits are packaged: there noise would change nothing."""
+    """As for agents' data: noise would change nothing there."""
     model = DTFM.load(run / "HalfCheetah-v5")
     model.policy.set_acting(flow_steps=1)
     model.save(run / "HalfCheetah-v5")
@@ -165,7 +165,7 @@ def test_how_often_a_run_is_evaluated_does_not_change_it(run, workplace, algorit
 
 
 def test_ppo_corrects_a_zip_file_with_a_target_of_its_own(run, workplace, capsys):
-    """As gaits are packaged; of the run's chunks one action is carried out, from the beginning of the curve on."""
+    """As for agents' data; one action of the run's chunks is executed, from the beginning of the curve on."""
     (workplace / "alone.zip").write_bytes((run / "HalfCheetah-v5.zip").read_bytes())
     target = ["--model", "alone.zip", "--algo", "ppo", "--target-return", "3", "--env-kwargs", "max_episode_steps:20"]
     assert main([*FINETUNE, *target, "-params", *QUICK_PPO]) == 0

@@ -7,7 +7,7 @@ from gymnasium import spaces
 
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer, expected
 
-N_STEPS, LUCK, N_EPISODES = 6, 8.0, 40
+N_STEPS, PRIZE, N_EPISODES = 6, 8.0, 40
 
 
 @pytest.fixture(autouse=True)
@@ -25,11 +25,11 @@ def buffer() -> TrajectoryBuffer:
     """
     episodes = []
     for i in range(N_EPISODES):
-        gambles, lucky = i % 2 == 1, i % 20 == 1
+        gambles, wins = i % 2 == 1, i % 20 == 1
         observations = np.full((N_STEPS, 1), -1.0 if gambles else 1.0, np.float32)
         observations[0] = 0.0
         rewards = np.zeros(N_STEPS) if gambles else np.ones(N_STEPS)
-        rewards[-1] += LUCK * lucky
+        rewards[-1] += PRIZE * wins
         episodes.append(Trajectory(observations, np.zeros((N_STEPS, 1), np.float32), rewards, terminated=True))
     return TrajectoryBuffer.from_trajectories(episodes, spaces.Box(-1, 1, (1,)))
 
@@ -44,7 +44,7 @@ def test_luck_becomes_what_may_be_expected(buffer):
     np.testing.assert_allclose(found[1::2, 0], 0.76 / 0.14, atol=0.4)
     # Within the last n steps nothing comes after them, and luck is what was recorded.
     np.testing.assert_array_equal(found[:, -1], by_episode(buffer)[:, -1])
-    assert found[1, -1] == LUCK
+    assert found[1, -1] == PRIZE
     # The rewards of n steps are those of the episode: what lies n before its end has all of them.
     np.testing.assert_allclose(by_episode(buffer.with_expected_returns(N_STEPS, seed=0)), by_episode(buffer))
 
@@ -68,7 +68,7 @@ def test_the_same_seed_gives_the_same_numbers(buffer):
 
 
 def test_some_of_the_episodes_are_learned_from_alone(buffer):
-    """Without the lucky ones nobody who goes by -1 earns anything, and the others' numbers are not touched."""
+    """Without the winners nobody who goes by -1 earns anything, and the others' numbers are not touched."""
     chosen = np.array([i for i in range(N_EPISODES) if i % 20 != 1])
     changed = buffer.select(chosen).with_expected_returns(1, seed=0)
     np.testing.assert_allclose(by_episode(changed)[chosen % 2 == 1, 0], 0.0, atol=0.4)
@@ -80,4 +80,4 @@ def test_the_rewards_of_n_to_2_n_steps_count_as_they_came(buffer, monkeypatch):
     monkeypatch.setattr(expected, "_regression", lambda steps, statistics, seed: th.zeros(len(steps.rows)))
     found = by_episode(buffer.with_expected_returns(2, seed=0))
     np.testing.assert_allclose(found[0], [3.0, 3.0, 2.5, 2.0, 2.0, 1.0])
-    np.testing.assert_allclose(found[1], [0.0, 0.0, 0.0, 0.0, LUCK, LUCK])
+    np.testing.assert_allclose(found[1], [0.0, 0.0, 0.0, 0.0, PRIZE, PRIZE])

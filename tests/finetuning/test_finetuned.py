@@ -137,7 +137,7 @@ def test_later_weights_of_the_agent_are_taken_over_when_asked(model):
 
 
 class Hundredfold(BaseFeaturesExtractor):
-    """Of the width of what is seen."""
+    """As wide as the observation."""
 
     def __init__(self, observation_space):
         super().__init__(observation_space, observation_space.shape[0])

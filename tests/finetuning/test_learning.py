@@ -73,7 +73,7 @@ def test_sac_finds_the_noise_whose_actions_are_rewarded():
 
 
 class Targets(Sides):
-    """An action is rewarded by how near it comes to 0.8 times what is seen."""
+    """An action is rewarded by how near it comes to 0.8 times the observation."""
 
     def step(self, action):
         target = 0.8 * self.shown

@@ -43,7 +43,7 @@ def play(model, n_steps=40):
 
 
 def play_residual(env, choose, n_steps=40):
-    """Likewise in the wrapper, whose rewards are in units of its own."""
+    """The same in the wrapper, whose rewards are in units of its own."""
     shown, totals, returns = env.reset(), np.zeros(3), [[], [], []]
     for _ in range(n_steps):
         shown, rewards, dones, infos = env.step(choose(shown))

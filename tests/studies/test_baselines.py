@@ -39,7 +39,7 @@ def at_the_root(monkeypatch):
 
 @pytest.fixture
 def buffer() -> TrajectoryBuffer:
-    """Episodes of Pendulum with every kind of end, whose actions are a linear map of what is seen."""
+    """Episodes of Pendulum with every kind of end, whose actions are a linear map of the observation."""
     rng = np.random.default_rng(0)
     matrix = np.array([[0.5], [-0.3], [0.1]])
     episodes = []
@@ -56,7 +56,8 @@ def datasets(tmp_path, buffer) -> Path:
     """A file like studies/baselines.yml, of one dataset."""
     buffer.save(tmp_path / "pendulum.npz")
     (tmp_path / "baselines.yml").write_text(
-        f"pendulum: {{task: Pendulum-v1, kind: manipulation, dataset: {tmp_path / 'pendulum.npz'}, target_return: 0, minutes: 1}}\n"
+        f"pendulum: {{task: Pendulum-v1, kind: manipulation, dataset: {tmp_path / 'pendulum.npz'}, "
+        "target_return: 0, minutes: 1}\n"
     )
     return tmp_path / "baselines.yml"
 
@@ -295,7 +296,7 @@ def test_every_dataset_of_the_comparison_is_a_task_with_settings_for_us_and_for_
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "kind"), SETTINGS)
-def test_a_peer_trains_and_acts(tmp_path, datasets, name, kind):
+def test_a_baseline_trains_and_acts(tmp_path, datasets, name, kind):
     worker = OTHERS[name].worker
     if not (python := PYTHONS[worker]).exists():
         pytest.skip(f"{python} does not exist; `make baselines` installs it")

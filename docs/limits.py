@@ -1,0 +1,85 @@
+"""
+Sizes that this project keeps, printed by `make lint`, which fails where one is above its limit.
+
+A word is what has a letter or a digit between two spaces; lines of code blocks and tables do not count as prose.
+"""
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[1]
+# Written by a tool, or tables that a test compares with the results.
+GENERATED = ("licences.md", "report.md")
+# The commit after which subjects follow CONTRIBUTING.
+SUBJECTS_SINCE = "8f2ec2e76aa61cf848541cb9fca7a28976c411f4"
+# Words that begin no imperative.
+NO_IMPERATIVE = re.compile(r"(A|An|The|Of|What|Who|Where|It|Its|This|That|There|\w+ing|\w+ed)\b")
+
+
+class Size(NamedTuple):
+    """
+    :param name: what is measured
+    :param found: its size
+    :param limit: the largest that is accepted
+    """
+
+    name: str
+    found: float
+    limit: float
+
+
+def words(text: str, prose: bool = False) -> int:
+    """Number of words; of prose alone, if asked for."""
+    if prose:
+        text = re.sub(r"^(```|~~~).*?^\1", "", text, flags=re.DOTALL | re.MULTILINE)
+        text = re.sub(r"^\s*\|.*$", "", text, flags=re.MULTILINE)
+    return sum(any(letter.isalnum() for letter in word) for word in text.split())
+
+
+def n_lines(path: str) -> int:
+    """Lines of a file."""
+    return len((ROOT / path).read_text().splitlines())
+
+
+def subjects() -> list[str]:
+    """Of the commits since the rule began; none in a copy without a history."""
+    command = ["git", "-C", str(ROOT), "log", "--no-merges", "--format=%s", f"{SUBJECTS_SINCE}..HEAD"]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.splitlines()
+
+
+def sizes() -> Iterator[Size]:
+    """Everything that has a limit."""
+    pages = [page for page in sorted((ROOT / "docs").rglob("*.md")) if page.name not in GENERATED]
+    results = [path for path in (ROOT / "results").rglob("*") if path.is_file()]
+    yield Size("lines of README", n_lines("README.md"), 120)
+    yield Size("lines of CHANGELOG, until the first release", n_lines("CHANGELOG.md"), 60)
+    yield Size("words of docs", sum(words(page.read_text()) for page in pages), 25_000)
+    for page in pages:
+        if page.parent.name == "studies":
+            yield Size(f"words of prose in studies/{page.name}", words(page.read_text(), prose=True), 700)
+    yield Size("files in results", len(results), 60)
+    yield Size("MB of results", sum(path.stat().st_size for path in results) / 1e6, 3.0)
+    if found := subjects():
+        yield Size("characters of the longest commit subject", max(map(len, found)), 72)
+        wrong = [subject for subject in found if NO_IMPERATIVE.match(subject) or subject.endswith(".")]
+        yield Size(f"commit subjects that are no imperative {wrong or ''}".rstrip(), len(wrong), 0)
+
+
+def main() -> None:
+    """
+    :raises SystemExit: with code 1 if one is above its limit
+    """
+    too_large = False
+    for name, found, limit in sizes():
+        too_large |= found > limit
+        mark = "  <- too large" if found > limit else ""
+        print(f"{found:8,.6g} of {limit:<8,g} {name}{mark}")
+    sys.exit(too_large)
+
+
+if __name__ == "__main__":
+    main()
