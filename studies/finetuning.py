@@ -150,7 +150,7 @@ def plot(folder: Path, task: str, labels: list[str], output: Path) -> None:
 
 def plot_rollouts(folder: Path) -> Figure:
     """
-    Share of final episodes that the seeds solve by the rollouts that they learned from, its mean with a 95 % interval (Student's t).
+    Success in the final episodes by rollouts that were learned from: mean over seeds, 95 % interval (Student's t).
 
     :param folder: of rows, whose tasks are shown side by side
     """
