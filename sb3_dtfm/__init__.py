@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sb3_dtfm.algorithms import DT, DTFM
 
 __all__ = ["DT", "DTFM"]
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 
 def __getattr__(name: str) -> Any:

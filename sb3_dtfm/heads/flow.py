@@ -66,8 +66,8 @@ class FlowHead(ActionHead):
 
     With `one_step_policy` a second network learns where `flow_steps` of Euler end, 16 at most, so that an action can take
     one evaluation instead of one per solver step. It learns from the field and passes no gradient back: trunk and field
-    are the same without it. Where the field predicts actions, this network adds to the same W h + b, and starts at zero too; else it
-    adds to the noise.
+    are the same without it. Where the field predicts actions, this network adds to the same W h + b, and starts at zero
+    too; else it adds to the noise.
 
     :param embed_dim: D
     :param action_dim: A
