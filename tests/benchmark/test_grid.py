@@ -66,6 +66,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
 def test_a_killed_grid_takes_its_cell_along_goes_on_and_repeats_nothing(grid, workplace, capfd, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
