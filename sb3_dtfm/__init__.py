@@ -1,13 +1,6 @@
 """Offline reinforcement learning for Stable-Baselines3: Decision Transformers with and without a flow-matching head."""
 
-import os
 from typing import TYPE_CHECKING, Any
-
-# Before torch starts its threads: by default they spin for milliseconds while they wait, and on a core that is shared with a
-# simulator or another job they take the time that the others need; where they sleep at once, they wake up too late
-# (docs/performance.md).
-if "OMP_WAIT_POLICY" not in os.environ:
-    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 import sb3_dtfm.envs  # noqa: F401  (registers the tasks)
 

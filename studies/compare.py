@@ -42,7 +42,7 @@ ACTING = {
 def measure(python: str, worker: str, *arguments: object) -> dict[str, float]:
     """One measurement in a fresh process."""
     command = [python, str(HERE / worker), *map(str, arguments)]
-    environment = {name: value for name, value in os.environ.items() if name != "GOMP_SPINCOUNT"}  # set by our import
+    environment = {name: value for name, value in os.environ.items() if name != "GOMP_SPINCOUNT"}
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     if done.returncode:
         sys.exit(f"{' '.join(command)} failed:\n{done.stderr}")

@@ -13,7 +13,7 @@ from rl_zoo3.utils import get_wrapper_class
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
-from sb3_dtfm.heads import HEADS
+from sb3_dtfm.heads import FlowHead
 from sb3_dtfm.zoo.registration import packaged_config, policy_of, register
 
 TARGETS = {
@@ -25,7 +25,7 @@ TARGETS = {
     "robosuite/Can-v0": 1,
     "robosuite/Square-v0": 1,
 }
-HEAD_KEYS = set(HEADS["DTFM"].options())
+HEAD_KEYS = set(FlowHead.options())
 SETTINGS = [None, "paper"]
 
 
