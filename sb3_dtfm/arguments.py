@@ -1,9 +1,11 @@
 """Arguments that a user gives, checked by name: one way to say what is accepted, one message for what is not."""
 
 import difflib
+import inspect
 import math
 import numbers
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -97,3 +99,15 @@ def with_nearest(names: Iterable[str], known: Iterable[str]) -> str:
     known = list(known)
     nearest = {name: difflib.get_close_matches(name, known, n=1) for name in names}
     return ", ".join(name + (f" (did you mean {found[0]}?)" if found else "") for name, found in nearest.items())
+
+
+def documented_parameters(described: type, names: Collection[str] | None = None) -> str:
+    """
+    The `:param` entries of a class's docstring.
+
+    :param described: the class
+    :param names: of the parameters to take; None for all
+    """
+    text = inspect.cleandoc(described.__doc__ or "")
+    entries = re.findall(r"^:param (\w+):(.*?)(?=^:|\Z)", text, re.DOTALL | re.MULTILINE)
+    return "\n".join(f":param {name}:{about.rstrip()}" for name, about in entries if names is None or name in names)

@@ -1,5 +1,6 @@
 """What an offline algorithm is made of: arguments, dataset, environment, policy, and the file it is saved to."""
 
+import inspect
 import io
 from abc import ABC
 from collections.abc import Iterable
@@ -31,6 +32,7 @@ from sb3_dtfm.arguments import (
     Number,
     Rule,
     check_arguments,
+    documented_parameters,
 )
 from sb3_dtfm.data import (
     Dataset,
@@ -129,6 +131,22 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
 
     policy: SequencePolicy
     action_space: ActionSpace
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """`help` of an algorithm lists all parameters, those of its policy and its head, too."""
+        super().__init_subclass__(**kwargs)
+        if "policy_aliases" in vars(cls):
+            policy = cls.policy_aliases[POLICY_NAMES[0]]
+            assert issubclass(policy, SequencePolicy)
+            head_options = set(policy.head_class.options())
+            parts = [
+                inspect.cleandoc(cls.__doc__ or ""),
+                documented_parameters(OfflineAlgorithm),
+                "`policy_kwargs` may hold:",
+                documented_parameters(SequencePolicy, policy.parameter_names() - head_options),
+                documented_parameters(policy.head_class, head_options),
+            ]
+            cls.__doc__ = "\n\n".join(filter(None, parts))
 
     def __init__(
         self,

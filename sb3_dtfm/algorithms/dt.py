@@ -13,8 +13,6 @@ class DT(OfflineSequenceAlgorithm):
     """
     Decision Transformer (Chen et al., 2021): the action is regressed, under a tanh, from the trunk's hidden state. Of a
     Discrete action space it is one of n, by cross-entropy.
-
-    Parameters are those of :class:`~sb3_dtfm.algorithms.base.OfflineAlgorithm`.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = dict.fromkeys(POLICY_NAMES, DTPolicy)

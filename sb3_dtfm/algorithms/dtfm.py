@@ -12,9 +12,6 @@ from sb3_dtfm.policies import DTFMPolicy
 class DTFM(OfflineSequenceAlgorithm):
     """
     Decision Transformer with flow matching: the trunk's hidden state conditions a vector field from noise to action.
-
-    Parameters are those of :class:`~sb3_dtfm.algorithms.base.OfflineAlgorithm`; `policy_kwargs` also takes the options of
-    :class:`~sb3_dtfm.heads.flow.FlowHead`.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = dict.fromkeys(POLICY_NAMES, DTFMPolicy)

@@ -1,5 +1,6 @@
 """Every argument is checked by name, before anything is learned: at construction, and where `load` changes it."""
 
+import inspect
 import re
 
 import numpy as np
@@ -225,3 +226,11 @@ def test_a_schedule_is_a_learning_rate(cheetah_buffer, saved):
         rates = []
         model.learn(2, callback=lambda *_: rates.append(model.policy.optimizer.param_groups[0]["lr"]) is None)  # noqa: B023
         assert rates == pytest.approx([1e-3, 0.5e-3])
+
+
+@pytest.mark.parametrize("algorithm", [DT, DTFM])
+def test_help_lists_every_parameter_those_of_policy_and_head_too(algorithm):
+    listed = re.findall(r"^:param (\w+): \S", inspect.getdoc(algorithm), re.MULTILINE)
+    constructor = set(inspect.signature(algorithm).parameters)
+    options = algorithm.policy_aliases["MultiInputPolicy"].parameter_names()
+    assert sorted(listed) == sorted([*constructor, *options])
