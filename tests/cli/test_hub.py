@@ -90,6 +90,7 @@ def test_a_pulled_run_is_what_was_pushed_and_enjoy_takes_it(repository, pushed, 
     assert capsys.readouterr().out.split("Episode Reward")[1:] == ours
 
 
+@pytest.mark.slow
 def test_through_a_hub_goes_what_goes_through_a_folder(pushed, repository, monkeypatch, capsys):
     """In a process of its own, as the client reads its settings when it is imported."""
     with running() as hub:

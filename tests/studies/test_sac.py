@@ -36,6 +36,7 @@ def test_recorded_steps_lie_in_the_replay_buffer():
     np.testing.assert_array_equal(after, observations[[1, 2, 3, 5, 6]])
 
 
+@pytest.mark.slow
 def test_a_run_is_evaluated(tmp_path, monkeypatch):
     cell = Cell("Pendulum-v1", 1.0, "dtfm", 3, "tiny")
     about = dict(

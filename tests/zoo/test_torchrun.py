@@ -50,6 +50,7 @@ def wait_for(path: Path) -> None:
         time.sleep(0.1)
 
 
+@pytest.mark.slow
 def test_process_0_does_what_rl_zoo_does_and_the_other_leaves_no_trace(workplace):
     settings = ["--eval-freq", "2", "--eval-episodes", "1", "--save-freq", "3", "-P", "-tb", "tb"]
     process = start(*TORCHRUN, *tiny_training("dtfm", "--dataset", DATASET_ID, *settings))
