@@ -13,8 +13,8 @@ from tests.data.corpus import write_lerobot
 ROOT = Path(__file__).parents[1]
 PACKAGE = "sb3_dtfm"
 
-# Room: its files, and the parts of the package that it may import.
-ROOMS = {
+# Part: its files, and the parts of the package that it may import.
+PARTS = {
     "networks": ("sb3_dtfm/networks", {"networks"}),
     "windows": ("sb3_dtfm/windows.py", set()),
     "arguments": ("sb3_dtfm/arguments.py", set()),
@@ -76,8 +76,8 @@ ROOMS = {
 }
 
 
-def files(room: str) -> list[Path]:
-    path = ROOT / ROOMS[room][0]
+def files(part: str) -> list[Path]:
+    path = ROOT / PARTS[part][0]
     found = sorted(path.rglob("*.py")) if path.is_dir() else [path]
     assert found
     return found
@@ -92,30 +92,30 @@ def imported_modules(path: Path) -> list[str]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
             package_only = node.module == PACKAGE
-            rooms = {name for name in ROOMS if name != ""}
+            parts = {name for name in PARTS if name != ""}
             modules += [
-                f"{PACKAGE}.{alias.name}" if package_only and alias.name in rooms else str(node.module)
+                f"{PACKAGE}.{alias.name}" if package_only and alias.name in parts else str(node.module)
                 for alias in node.names
             ]
     return modules
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_a_room_imports_only_the_rooms_below_it(room):
-    for path in files(room):
+@pytest.mark.parametrize("part", PARTS)
+def test_a_room_imports_only_the_rooms_below_it(part):
+    for path in files(part):
         own = {module for module in imported_modules(path) if module.split(".")[0] == PACKAGE}
-        rooms = {module.split(".")[1] if "." in module else "" for module in own}
-        assert rooms <= ROOMS[room][1], f"{path.relative_to(ROOT)} imports {sorted(own)}"
+        parts = {module.split(".")[1] if "." in module else "" for module in own}
+        assert parts <= PARTS[part][1], f"{path.relative_to(ROOT)} imports {sorted(own)}"
 
 
 def test_rooms_form_no_circle():
-    """A room comes after all rooms that it may import, so that some order has them all."""
-    below = {room: allowed - {room, ""} for room, (_, allowed) in ROOMS.items()}
+    """A part comes after all parts that it may import, so that some order has them all."""
+    below = {part: allowed - {part, ""} for part, (_, allowed) in PARTS.items()}
     below["zoo"] |= {"algorithms"}  # what "" is: the package's own names
     ordered: set[str] = set()
-    while free := {room for room in below if room not in ordered and below[room] <= ordered}:
+    while free := {part for part in below if part not in ordered and below[part] <= ordered}:
         ordered |= free
-    assert ordered == set(ROOMS), f"a circle among {sorted(set(ROOMS) - ordered)}"
+    assert ordered == set(PARTS), f"a circle among {sorted(set(PARTS) - ordered)}"
 
 
 def test_networks_need_torch_and_numpy_alone():
@@ -126,7 +126,7 @@ def test_networks_need_torch_and_numpy_alone():
 
 
 def test_every_module_belongs_to_a_room():
-    known = {path for room in ROOMS for path in files(room)} | {
+    known = {path for part in PARTS for path in files(part)} | {
         ROOT / "sb3_dtfm" / name for name in ("__init__.py", "__main__.py")
     }
     assert set((ROOT / "sb3_dtfm").rglob("*.py")) <= known

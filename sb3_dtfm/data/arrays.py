@@ -14,7 +14,7 @@ import numpy as np
 from sb3_dtfm.data.cache import existing_file
 from sb3_dtfm.data.hdf5 import read_hdf5
 from sb3_dtfm.data.observations import as_vectors
-from sb3_dtfm.data.trajectories import DatasetError, check_real, check_size, naming
+from sb3_dtfm.data.trajectories import DatasetError, check_real, check_size, wrap_dataset_errors
 
 NPZ_SUFFIX = ".npz"
 EXPECTED = "the path of a file of flat arrays (.npz, .hdf5)"
@@ -59,7 +59,7 @@ class Arrays(ABC):
         """The first of the named arrays that is there: numbers, one entry a step."""
         name = self.name(names)
         where = f"{self.source}: {name}"
-        with naming(where):
+        with wrap_dataset_errors(where):
             array = self._get(name, where)
         check_real(array.dtype, where)
         if n_steps is not None and array.shape[:1] != (n_steps,):
@@ -87,7 +87,7 @@ class _Npz(Arrays):
         where = f"{self.source}: {ENV_ID}"
         if not self.has((ENV_ID,)):
             return None
-        with naming(where):
+        with wrap_dataset_errors(where):
             dtype = self._header(ENV_ID, where)
             array = self._stored(ENV_ID) if dtype.kind == "U" else np.zeros(0)
         if array.size != 1:
@@ -135,7 +135,7 @@ class _InMemory(Arrays):
 
     def _get(self, name: str, where: str) -> np.ndarray:
         found = self._arrays[name]
-        with naming(where, NUMBERS_EXPECTED):
+        with wrap_dataset_errors(where, NUMBERS_EXPECTED):
             return as_vectors(found, where) if isinstance(found, Mapping) else np.asarray(found)
 
 
@@ -152,7 +152,7 @@ def opened(dataset: str | os.PathLike[str] | Mapping[str, Any]) -> Iterator[Arra
         return
     path = existing_file(dataset, EXPECTED)
     source = str(path)
-    with naming(source), contextlib.ExitStack() as stack:
+    with wrap_dataset_errors(source), contextlib.ExitStack() as stack:
         if path.name.endswith(NPZ_SUFFIX):
             yield _Npz(stack.enter_context(zipfile.ZipFile(path)), source)
         else:

@@ -6,7 +6,7 @@ import math
 import h5py
 import numpy as np
 
-from sb3_dtfm.data.trajectories import DatasetError, check_real, check_size, naming
+from sb3_dtfm.data.trajectories import DatasetError, check_real, check_size, wrap_dataset_errors
 
 
 def read_hdf5(group: h5py.Group, name: str, where: str) -> np.ndarray:
@@ -21,7 +21,7 @@ def read_hdf5(group: h5py.Group, name: str, where: str) -> np.ndarray:
     :raises DatasetError: there is none, it holds no numbers, lies in another file, or is not there in full
     """
     data, shape, dtype = open_hdf5(group, name, where)
-    with naming(f"{where}: {name}"):
+    with wrap_dataset_errors(f"{where}: {name}"):
         values = np.empty(shape, dtype)
         if values.size > 0:
             data.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
@@ -39,7 +39,7 @@ def open_hdf5(group: h5py.Group, name: str, where: str) -> tuple[h5py.h5d.Datase
         data = h5py.h5d.open(group.id, name.encode())
     except (KeyError, TypeError, ValueError, OSError, RuntimeError) as error:  # no such name, a group, a link astray
         raise DatasetError(f"{where}: has no {name!r}, only {listed(group)}; the file is incomplete.") from error
-    with naming(what):
+    with wrap_dataset_errors(what):
         shape, dtype, n_stored = data.shape, data.dtype, data.get_storage_size()
         in_file = h5py.h5f.get_name(data) == h5py.h5f.get_name(group.id) and _stored_within(data)
     check_real(dtype, what)
@@ -73,7 +73,7 @@ def open_group(parent: h5py.Group, name: str, where: str) -> h5py.Group:
     :param where: the file, for messages
     :raises DatasetError: there is none, or it lies in another file
     """
-    with naming(f"{where}: {name}"):
+    with wrap_dataset_errors(f"{where}: {name}"):
         group = parent.get(name)
         if not isinstance(group, h5py.Group):
             raise DatasetError(f"{where}: has no group {name!r}, only {listed(parent)}.")

@@ -27,7 +27,7 @@ from sb3_dtfm.data.flat import (
 )
 from sb3_dtfm.data.observations import as_vectors, flatten_observations
 from sb3_dtfm.data.storage import FileStorage
-from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_space, check_flags, naming
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_space, check_flags, wrap_dataset_errors
 from sb3_dtfm.envs.return_to_go import flatten_observation_space, sort_observation_space
 from sb3_dtfm.envs.success import reported_success
 
@@ -105,7 +105,7 @@ def _trajectory(episode: Any, number: int, source: str) -> Trajectory:
     where = f"{source}, {name}"
     if isinstance(episode, Trajectory):
         return episode
-    with naming(where, NUMBERS_EXPECTED):
+    with wrap_dataset_errors(where, NUMBERS_EXPECTED):
         if isinstance(episode, Mapping):
             return _of_arrays(episode, name, where)
         if hasattr(episode, "obs") and hasattr(episode, "acts"):

@@ -14,7 +14,7 @@ from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, files_below
 from sb3_dtfm.data.flat import bounded_space, fitted, json_options
 from sb3_dtfm.data.storage import FileStorage
-from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_real, check_size, naming
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_real, check_size, wrap_dataset_errors
 
 INFO, DATA = "meta/info.json", "data"
 ACTION, REWARD, SUCCESS, DONE = "action", "next.reward", "next.success", "next.done"
@@ -69,7 +69,7 @@ def load_lerobot(
     """
     folder = Path(path).expanduser()
     source = str(folder)
-    with naming(f"{source}: {INFO}"):
+    with wrap_dataset_errors(f"{source}: {INFO}"):
         info = json.loads((folder / INFO).read_text())
         features = {name: tuple(each["shape"]) for name, each in info["features"].items() if each["dtype"] in NUMBERS}
         told = {"total_frames": int(info["total_frames"]), "total_episodes": int(info["total_episodes"])}
@@ -148,7 +148,7 @@ def _read(folder: Path, names: Sequence[str], n_frames: int, source: str) -> tup
     parts: list[dict[str, np.ndarray]] = []
     n_found = n_numbers = 0
     for path in paths:
-        with naming(str(path)), pyarrow.parquet.ParquetFile(path) as file:
+        with wrap_dataset_errors(str(path)), pyarrow.parquet.ParquetFile(path) as file:
             missing = sorted(set(names) - set(file.schema_arrow.names))
             if missing:
                 raise DatasetError(f"{path}: has no column {', '.join(missing)}.")
@@ -161,7 +161,7 @@ def _read(folder: Path, names: Sequence[str], n_frames: int, source: str) -> tup
             parts.append({name: _numbers(table[name].combine_chunks(), f"{path}: {name}") for name in names})
     if n_found != n_frames:
         raise DatasetError(f"{source}: {INFO} tells of {n_frames} frames; there are {n_found}.")
-    with naming(source):
+    with wrap_dataset_errors(source):
         return {name: np.concatenate([part[name] for part in parts]) for name in names}, n_stored
 
 

@@ -23,7 +23,7 @@ from sb3_dtfm.data.cache import Fingerprint
 from sb3_dtfm.data.hdf5 import open_group, read_hdf5
 from sb3_dtfm.data.observations import ReadArray, flatten_observations
 from sb3_dtfm.data.storage import FileStorage
-from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, check_flags, naming
+from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, check_flags, wrap_dataset_errors
 from sb3_dtfm.envs.return_to_go import flatten_observation_space, sort_observation_space
 from sb3_dtfm.envs.success import SUCCESS
 
@@ -101,14 +101,14 @@ def load_minari(
     metadata = read_metadata(folder, dataset.id)
     if len(dataset.episode_indices) == 0:
         raise DatasetError(f"{source}: holds no episode; at least one is needed.")
-    with contextlib.ExitStack() as stack, naming(source):
+    with contextlib.ExitStack() as stack, wrap_dataset_errors(source):
         env_spec = dataset.env_spec
         observation_space = _flat(dataset.observation_space, source)
         read = _hdf5_reader(stack, folder, source) if in_hdf5 else _arrow_reader(dataset.storage.FORMAT, folder, source)
 
         def trajectory(index: int) -> Trajectory:
             name = f"episode {index}"
-            with naming(f"{source}, {name}"):
+            with wrap_dataset_errors(f"{source}, {name}"):
                 return make_trajectory(*read(index), dataset.observation_space, name, source)
 
         buffer = TrajectoryBuffer.from_trajectories(
@@ -142,7 +142,7 @@ def open_minari(dataset_id: str) -> minari.MinariDataset:
     if not folder.exists():
         _download(dataset_id)
     read_metadata(folder, dataset_id)
-    with naming(f"Minari dataset {dataset_id} ({folder / METADATA_FILE_NAME})"):
+    with wrap_dataset_errors(f"Minari dataset {dataset_id} ({folder / METADATA_FILE_NAME})"):
         return minari.load_dataset(dataset_id)
 
 
@@ -173,19 +173,19 @@ def read_metadata(folder: Path, dataset_id: str) -> dict[str, Any]:
     """
     path = folder / METADATA_FILE_NAME
     source = f"Minari dataset {dataset_id} ({path})"
-    with naming(source):
+    with wrap_dataset_errors(source):
         metadata = json.loads(path.read_text())
     if not isinstance(metadata, dict):
         raise DatasetError(f"{source}: holds a {type(metadata).__name__}; a JSON object is expected.")
     _check_fields(metadata, source)
     for name in ("observation_space", "action_space"):
-        with naming(f"{source}: {name}"):
+        with wrap_dataset_errors(f"{source}: {name}"):
             n_entries = _n_entries(json.loads(metadata[name]))
             if not n_entries <= MOST_ENTRIES:
                 raise DatasetError(f"{source}: {name} has {n_entries} entries; up to {MOST_ENTRIES} are accepted.")
             deserialize_space(metadata[name])
     for name in ("env_spec", "eval_env_spec"):
-        with naming(f"{source}: {name}"):
+        with wrap_dataset_errors(f"{source}: {name}"):
             if metadata.get(name) is not None and not isinstance(json.loads(metadata[name]), dict):
                 raise DatasetError(f"{source}: {name} is {reprlib.repr(metadata[name])}; a JSON object is expected.")
     n_episodes = _n_episodes(folder, metadata["data_format"], dataset_id)
@@ -219,7 +219,7 @@ def _n_entries(space: dict[str, Any]) -> int:
 def _n_episodes(folder: Path, data_format: str, dataset_id: str) -> int:
     """How many episodes are there, whatever the metadata say."""
     data = folder / HDF5_FILE_NAME if data_format == "hdf5" else folder
-    with naming(f"Minari dataset {dataset_id} ({data})"):
+    with wrap_dataset_errors(f"Minari dataset {dataset_id} ({data})"):
         if data_format != "hdf5":
             return sum(path.name.isdigit() for path in data.iterdir())
         with h5py.File(data, "r") as file:
@@ -292,7 +292,7 @@ def _arrow_reader(data_format: str, folder: Path, source: str) -> Callable[[int]
         table.validate(full=True)
 
         def array(name: str, *path: str | int) -> np.ndarray:
-            with naming(f"{source}, episode {index}: {name}"):
+            with wrap_dataset_errors(f"{source}, episode {index}: {name}"):
                 values = table[name].combine_chunks()
                 for key in path:
                     values = values.field(str(key))

@@ -14,7 +14,7 @@ from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, existing_file
 from sb3_dtfm.data.hdf5 import listed, open_group, open_hdf5, read_hdf5
 from sb3_dtfm.data.storage import FileStorage
-from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_finite, check_flags, naming
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_finite, check_flags, wrap_dataset_errors
 from sb3_dtfm.envs.robosuite import env_id_from_robomimic
 
 DEFAULT_OBSERVATION_KEYS = ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos", "object")
@@ -77,7 +77,7 @@ def load_robomimic(
     source = str(path)
     if not h5py.is_hdf5(path):
         raise DatasetError(f"{source}: not an hdf5 file; a robomimic hdf5 file is expected.")
-    with naming(source), h5py.File(path, "r") as file:
+    with wrap_dataset_errors(source), h5py.File(path, "r") as file:
         return _read(file, source, filter_key, tuple(observation_keys or DEFAULT_OBSERVATION_KEYS), on_invalid, storage)
 
 
@@ -121,7 +121,7 @@ def _read(
         if name in refused:
             raise refused[name]
         where = f"{source}, {name}"
-        with naming(where):
+        with wrap_dataset_errors(where):
             length, dones = len(rewards[name]), labels[name].dones
             observations = _observations(groups[name], where, labels[name].n_steps, observation_keys)
             success = bool(rewards[name][-1] >= 1.0)
@@ -136,7 +136,7 @@ def _read(
                 name=name,
             )
 
-    with naming(f"{source}: attribute 'env_args' of group 'data'"):
+    with wrap_dataset_errors(f"{source}: attribute 'env_args' of group 'data'"):
         env_id = env_id_from_robomimic(env_args)
     n_actions = next((labels[name].n_actions for name in demos if name in labels), None)
     if n_actions is None:
@@ -174,7 +174,7 @@ def _filtered(file: h5py.File, source: str, filter_key: str, demos: list[str]) -
 
 
 def _env_args(data: h5py.Group, source: str) -> dict[str, Any]:
-    with naming(f"{source}: attribute 'env_args' of group 'data' is not JSON"):
+    with wrap_dataset_errors(f"{source}: attribute 'env_args' of group 'data' is not JSON"):
         env_args = json.loads(data.attrs.get("env_args", "{}"))
     return env_args if isinstance(env_args, dict) else {}
 
@@ -200,7 +200,7 @@ def _labels(demo: h5py.Group, where: str) -> _Labels:
         check_finite(rewards, "rewards", where)
     if "dones" in set(demo):
         dones = check_flags(read_hdf5(demo, "dones", where), n_steps, f"{where}: dones")
-    with naming(where):
+    with wrap_dataset_errors(where):
         _check_count(demo, "num_samples", n_steps, where)
     return _Labels(rewards, dones, n_steps, n_actions)
 
@@ -284,7 +284,7 @@ def _in_frame(vectors: np.ndarray, quaternions: np.ndarray) -> np.ndarray:
 
 def _action_space(env_args: dict[str, Any], n_actions: int, source: str) -> spaces.Box:
     """The controller's input range for the arm, [-1, 1] for the gripper and where the file says nothing."""
-    with naming(f"{source}: attribute 'env_args' of group 'data'"):
+    with wrap_dataset_errors(f"{source}: attribute 'env_args' of group 'data'"):
         config = env_args.get("env_kwargs", {}).get("controller_configs") or {}
         config = config[0] if isinstance(config, list) else config
         arm = config.get("body_parts", {}).get("right", config)

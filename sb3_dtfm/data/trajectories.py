@@ -29,7 +29,7 @@ class DatasetError(ValueError):
 
 
 @contextlib.contextmanager
-def naming(where: str, why: str = "the file is damaged or incomplete, or cut off") -> Iterator[None]:
+def wrap_dataset_errors(where: str, why: str = "the file is damaged or incomplete, or cut off") -> Iterator[None]:
     """
     Whatever the libraries that read a file raise over it becomes our own error, which says where.
 
