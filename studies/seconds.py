@@ -1,8 +1,9 @@
 """
 Seconds from the command to 95 % of what the best tenth of the recorded episodes reached, on one core: docs/performance.md.
 
-    PYTHONPATH=studies python studies/seconds.py run results/seconds
-    PYTHONPATH=studies python studies/seconds.py table results/seconds --figure docs/seconds.png
+    PYTHONPATH=studies python studies/seconds.py run mine
+    sb3-dtfm report mine --csv results/seconds.csv
+    PYTHONPATH=studies python studies/seconds.py table results/seconds.csv --figure docs/seconds.png
 
 Data sets are those of studies/suite.yml. `wall_s` of a row are processor seconds of the learning process since it was
 started: imports, reading the data, and all gradient steps; neither environments nor evaluations. d3rlpy's algorithms need
@@ -22,7 +23,8 @@ from sb3_dtfm.benchmark import provenance
 from sb3_dtfm.benchmark.cloning import Cloning
 from sb3_dtfm.benchmark.evaluation import TRAINING_STATES, Episodes, evaluate, make_seeded_envs
 from sb3_dtfm.benchmark.grid import Job, plan
-from sb3_dtfm.benchmark.rows import BASELINES, Row, read_rows, write_row
+from sb3_dtfm.benchmark.results import read_results
+from sb3_dtfm.benchmark.rows import BASELINES, Row, write_row
 from sb3_dtfm.cli.benchmark import parse_arguments
 from sb3_dtfm.data import TrajectoryBuffer, load_dataset
 from sb3_dtfm.envs import known_task
@@ -77,8 +79,7 @@ class Cell:
         self.job, self.algo = job, algo
         self.vec_env = make_seeded_envs(job.task.env_id, job.settings, N_ENVS)
         self.rows: list[Row] = []
-        best = job.data["best_success"]
-        self.enough = ENOUGH * (job.data["best_return"] if best is None else best)
+        self.enough = enough(job.data)
 
     def buffer(self) -> TrajectoryBuffer:
         """The episodes, as `train` reads them."""
@@ -114,6 +115,12 @@ class Cell:
 def reached(episodes: Episodes) -> float:
     """Success in [0, 1], or mean return."""
     return float(np.mean(episodes.returns if episodes.successes is None else episodes.successes))
+
+
+def enough(data: dict[str, Any]) -> float:
+    """95 % of what the best tenth of the recorded episodes reached."""
+    best = data["best_success"]
+    return ENOUGH * (data["best_return"] if best is None else best)
 
 
 class Reached(Exception):  # noqa: N818 - no error
@@ -233,16 +240,14 @@ def run(options: argparse.Namespace) -> None:
                 subprocess.run([sys.executable, __file__, *sys.argv[1:], *one], check=True)
 
 
-def seconds_by_cell(folder: Path) -> dict[tuple[str, str], list[tuple[float, bool]]]:
+def seconds_by_cell(results: Path) -> dict[tuple[str, str], list[tuple[float, bool]]]:
     """By data and algorithm, of each seed: the seconds, and whether it had reached what is enough by then."""
     found: dict[tuple[str, str], list[tuple[float, bool]]] = {}
-    for path in sorted(folder.glob("*.jsonl")):
-        last = read_rows(path)[-1]
-        label = "@".join(filter(None, (last["algo"], last["label"])))
-        best = last["data"]["best_success"]
-        enough = ENOUGH * (last["data"]["best_return"] if best is None else best)
-        value = reached(Episodes(last["returns"], [], last["successes"]))
-        found.setdefault((last["task"], label), []).append((last["wall_s"], value >= enough))
+    (rows,) = read_results([results]).values()
+    for last in sorted((row for row in rows if row["final"]), key=lambda row: row["seed"]):
+        value = last["mean_return"] if last["successes"] is None else last["successes"] / last["n_episodes"]
+        algo = "@".join(filter(None, (last["algo"], last["label"])))
+        found.setdefault((last["task"], algo), []).append((last["wall_s"], value >= enough(last["data"])))
     return found
 
 
@@ -285,7 +290,7 @@ def main() -> None:
     """See the top."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("run", "table"))
-    parser.add_argument("results", type=Path, help="folder of the rows")
+    parser.add_argument("results", type=Path, help="folder of rows, or for `table` a CSV file")
     parser.add_argument("--data", nargs="+", default=list(DATA), help="of studies/suite.yml")
     parser.add_argument("--algo", nargs="+", choices=list(NAMES), default=list(NAMES))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
