@@ -38,9 +38,7 @@ def fill(replay: ReplayBuffer, recorded: TrajectoryBuffer, agent: SAC) -> int:
     :param agent: scales actions
     :return: how many steps were put in; less than one for each environment are left over
     """
-    observations, actions, rewards = (
-        getattr(recorded, name)[recorded.rows].numpy() for name in ("observations", "actions", "rewards")
-    )
+    observations, actions, rewards = (getattr(recorded, name).numpy() for name in ("observations", "actions", "rewards"))
     actions = agent.policy.scale_action(actions)
     following = np.roll(observations, -1, axis=0)  # behind a terminated episode's last step nobody looks at it
     lasts = np.cumsum(recorded.episode_lengths) - 1

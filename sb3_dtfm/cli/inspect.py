@@ -168,7 +168,7 @@ def draw(buffer: TrajectoryBuffer, found: Inspection, output: Path, title: str) 
     chosen = order[np.linspace(0, len(order) - 1, min(N_DRAWN, len(order))).astype(int)]
     for episode in chosen:
         some = buffer.select(np.array([episode]))
-        over_time.plot(some.returns_to_go[some.rows].cpu().numpy(), color=BLUE, alpha=0.35, linewidth=1.0)
+        over_time.plot(some.returns_to_go.cpu().numpy(), color=BLUE, alpha=0.35, linewidth=1.0)
     over_time.set(xlabel="step", ylabel="return-to-go")
     _draw_actions(actions, buffer.action_space, found.actions)
     for axis in (returns, lengths, over_time, actions):

@@ -159,7 +159,7 @@ class TrajectoryBuffer(FlatSteps):
 
         :return: (2, T) of the T steps of the longest episode, environment reward units
         """
-        timesteps, values = self.timesteps.cpu(), self.returns_to_go[self.rows].cpu()
+        timesteps, values = self.timesteps.cpu(), self.returns_to_go.cpu()
         n_timesteps = int(self.episode_lengths.max())
         low = th.full((n_timesteps,), th.inf).scatter_reduce_(0, timesteps, values, "amin")
         high = th.full((n_timesteps,), -th.inf).scatter_reduce_(0, timesteps, values, "amax")
@@ -174,7 +174,7 @@ class TrajectoryBuffer(FlatSteps):
 
         :return: (2, T) of the T steps of the longest episode, environment reward units
         """
-        timesteps, values = self.timesteps.cpu(), self.returns_to_go[self.rows].cpu().double()
+        timesteps, values = self.timesteps.cpu(), self.returns_to_go.cpu().double()
         zeros = th.zeros(int(self.episode_lengths.max()), dtype=th.float64)
         count = zeros.index_add(0, timesteps, th.ones_like(values))
         mean = zeros.index_add(0, timesteps, values) / count
@@ -194,10 +194,11 @@ class TrajectoryBuffer(FlatSteps):
         :return: on the same flat tensors, but for the returns-to-go
         """
         rows, timesteps, n_left = self._locate(th.arange(len(self), device=self._stops.device))
-        steps = Steps(self.observations, self.returns_to_go, rows, timesteps, n_left)
+        steps = Steps(self.stored["observations"], self.stored["returns_to_go"], rows, timesteps, n_left)
         changed = copy.copy(self)
-        changed.returns_to_go = self.returns_to_go.clone()
-        changed.returns_to_go[rows] = expected_returns_to_go(steps, n_steps, self.statistics(), seed)
+        expected = self.stored["returns_to_go"].clone()
+        expected[rows] = expected_returns_to_go(steps, n_steps, self.statistics(), seed)
+        changed.stored = {**self.stored, "returns_to_go": expected}
         return changed
 
     def within(self, max_episode_steps: int) -> "TrajectoryBuffer":
@@ -224,14 +225,15 @@ class TrajectoryBuffer(FlatSteps):
         table.lengths[longer], table.terminated[longer], table.truncated[longer] = max_episode_steps, False, True
         table.successes[longer[table.successes[longer] == 1.0]] = np.nan
         changed = copy.copy(self)
-        changed.returns_to_go = self.returns_to_go.clone()
+        shortened = self.stored["returns_to_go"].clone()
         for episode in longer:
             steps = slice(table.starts[episode], table.starts[episode] + max_episode_steps)
-            to_go = returns_to_go(self.rewards[steps].cpu().numpy())
-            changed.returns_to_go[steps] = th.from_numpy(to_go).to(changed.returns_to_go)
+            to_go = returns_to_go(self.stored["rewards"][steps].cpu().numpy())
+            shortened[steps] = th.from_numpy(to_go).to(shortened)
             table.returns[episode], table.return_scales[episode] = to_go[0], np.abs(to_go).max()
-            found = moments(self.observations[steps].cpu().numpy())
+            found = moments(self.stored["observations"][steps].cpu().numpy())
             table.observation_means[episode], table.observation_squares[episode] = found
+        changed.stored = {**self.stored, "returns_to_go": shortened}
         changed._set_episodes(table)
         return changed
 
@@ -244,7 +246,7 @@ class TrajectoryBuffer(FlatSteps):
         """
         largest = 0.0
         for start, length in zip(self.episodes.starts, self.episodes.lengths, strict=True):
-            to_go = self.rewards[start : start + length].cpu().numpy().astype(np.float64)
+            to_go = self.stored["rewards"][start : start + length].cpu().numpy().astype(np.float64)
             n_summed = 1  # steps that each sum has
             while n_summed < length:
                 to_go[:-n_summed] += gamma**n_summed * to_go[n_summed:]
@@ -337,8 +339,7 @@ class TrajectoryBuffer(FlatSteps):
             if other.env_id is not None:
                 named.check_task(other.env_id)
         tensors = {
-            name: th.cat([getattr(each, name).index_select(0, each.rows).to(first.observations.device) for each in buffers])
-            for name in STEP_ARRAYS
+            name: th.cat([getattr(each, name).to(first.stored[name].device) for each in buffers]) for name in STEP_ARRAYS
         }
         table = EpisodeTable(*map(np.concatenate, zip(*(each.episodes for each in buffers), strict=True)))
         table = table._replace(starts=np.cumsum(table.lengths) - table.lengths)
@@ -376,12 +377,10 @@ class TrajectoryBuffer(FlatSteps):
         path = with_npz(path)
         if (self.weights != self.weights[0]).any():
             warnings.warn(f"{path}: has no weights of episodes; give them again when it is read.", stacklevel=2)
-        rows, stops = self.rows, self._stops.cpu().numpy()
+        stops = self._stops.cpu().numpy()
         ended = {name: np.zeros(len(self), bool) for name in ("terminations", "truncations")}
         ended["terminations"][stops - 1], ended["truncations"][stops - 1] = self.terminated, self.truncated
-        steps = {
-            name: getattr(self, name).index_select(0, rows).cpu().numpy() for name in ("observations", "actions", "rewards")
-        }
+        steps = {name: getattr(self, name).cpu().numpy() for name in ("observations", "actions", "rewards")}
         steps["actions"] = from_vectors(steps["actions"], self.action_space)
         space = dict(zip(("action_low", "action_high"), bounds_of(self.action_space), strict=True))
         named = {} if self.env_id is None else {"env_id": np.array(self.env_id)}

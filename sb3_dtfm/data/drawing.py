@@ -25,14 +25,12 @@ class FlatSteps:
     :param tensors: (N, ...) for each of `STEP_ARRAYS`
     :param episodes: the own ones, which need not be all that lie in the tensors
     :param maps: the tensors that are files, of those that windows hold
+    :ivar stored: the tensors, which buffers of other episodes share; the buffer's own steps lie at `rows`
     """
 
     def __init__(self, tensors: dict[str, th.Tensor], episodes: EpisodeTable, maps: Sequence[MappedSteps] = ()) -> None:
-        self.observations = tensors["observations"]
-        self.actions = tensors["actions"]
-        self.rewards = tensors["rewards"]
-        self.returns_to_go = tensors["returns_to_go"]
-        self.device = self.observations.device
+        self.stored = {name: tensors[name] for name in STEP_ARRAYS}
+        self.device = tensors["observations"].device
         self.weights = np.ones(len(episodes.lengths))
         self._maps = maps
         self._present = th.zeros(0, dtype=th.int64)
@@ -42,11 +40,13 @@ class FlatSteps:
         self.episodes = episodes
         stops = np.cumsum(episodes.lengths)
         # Positions among the buffer's own steps at which each episode ends, and what leads from a position to its row.
-        self._stops = th.from_numpy(stops).to(self.observations.device)
-        self._firsts = th.from_numpy(stops - episodes.lengths).to(self.observations.device)
-        self._starts = th.from_numpy(episodes.starts).to(self.observations.device)
-        self._terminated = th.from_numpy(episodes.terminated).to(self.observations.device)
+        stored = self.stored["observations"]
+        self._stops = th.from_numpy(stops).to(stored.device)
+        self._firsts = th.from_numpy(stops - episodes.lengths).to(stored.device)
+        self._starts = th.from_numpy(episodes.starts).to(stored.device)
+        self._terminated = th.from_numpy(episodes.terminated).to(stored.device)
         self._n_steps = int(stops[-1])
+        self._is_whole = self._n_steps == len(stored) and np.array_equal(episodes.starts, stops - episodes.lengths)
 
     def __len__(self) -> int:
         """Number of the buffer's own steps."""
@@ -58,6 +58,30 @@ class FlatSteps:
         return len(self._maps) > 0
 
     @property
+    def observations(self) -> th.Tensor:
+        """(len(self), O) float32, of the buffer's own steps, episode after episode."""
+        return self._own("observations")
+
+    @property
+    def actions(self) -> th.Tensor:
+        """(len(self), A) float32, in the environment's range; Discrete ones as vectors."""
+        return self._own("actions")
+
+    @property
+    def rewards(self) -> th.Tensor:
+        """(len(self),) float32, environment reward units."""
+        return self._own("rewards")
+
+    @property
+    def returns_to_go(self) -> th.Tensor:
+        """(len(self),) float32, environment reward units."""
+        return self._own("returns_to_go")
+
+    def _own(self, name: str) -> th.Tensor:
+        """Of the buffer's own steps; a copy where the tensor holds others, too."""
+        return self.stored[name] if self._is_whole else self.stored[name].index_select(0, self.rows)
+
+    @property
     def timesteps(self) -> th.Tensor:
         """(len(self),) int64, the buffer's own steps counted from their episodes' starts; made anew at each call."""
         lengths = th.from_numpy(self.episodes.lengths).to(self._firsts.device)
@@ -65,7 +89,7 @@ class FlatSteps:
 
     @property
     def rows(self) -> th.Tensor:
-        """(len(self),) int64, where the buffer's own steps lie in the flat tensors; made anew at each call."""
+        """(len(self),) int64, where the buffer's own steps lie in the stored tensors; made anew at each call."""
         return self._locate(th.arange(len(self), device=self._stops.device))[0]
 
     def to(self: SelfSteps, device: th.device | str) -> SelfSteps:
@@ -76,14 +100,12 @@ class FlatSteps:
         """
         moved = copy.copy(self)
         moved.device = th.device(device)
-        tensors = {name: getattr(self, name) for name in STEP_ARRAYS}
         if moved.device.type == "cuda":
             free, _ = th.cuda.mem_get_info(moved.device)
-            if sum(tensor.nbytes for tensor in tensors.values()) > DEVICE_MEMORY_SHARE * free:
+            if sum(tensor.nbytes for tensor in self.stored.values()) > DEVICE_MEMORY_SHARE * free:
                 return moved
-        for name, tensor in tensors.items():
-            setattr(moved, name, tensor.to(moved.device))
-        moved.device = moved.observations.device
+        moved.stored = {name: tensor.to(moved.device) for name, tensor in self.stored.items()}
+        moved.device = moved.stored["observations"].device
         moved._maps = self._maps if moved.device.type == "cpu" else ()
         moved._set_episodes(self.episodes)
         return moved
@@ -168,13 +190,13 @@ class FlatSteps:
         terminated = self._terminated[th.searchsorted(self._stops, positions, right=True)]
         steps = th.arange(n_steps, device=rows.device)
         ahead = (rows.unsqueeze(1) + th.minimum(steps, n_left.unsqueeze(1))).flatten()
-        discounted = self.rewards.index_select(0, ahead).view(-1, n_steps) * gamma**steps
+        discounted = self.stored["rewards"].index_select(0, ahead).view(-1, n_steps) * gamma**steps
         goes_on = n_left >= n_steps
         batch = Transitions(
-            observations=self.observations.index_select(0, rows),
-            actions=self.actions.index_select(0, ahead).view(len(rows), -1),
+            observations=self.stored["observations"].index_select(0, rows),
+            actions=self.stored["actions"].index_select(0, ahead).view(len(rows), -1),
             rewards=(discounted * (steps <= n_left.unsqueeze(1))).sum(dim=1),
-            next_observations=self.observations.index_select(0, rows + th.minimum(steps[-1] + 1, n_left)),
+            next_observations=self.stored["observations"].index_select(0, rows + th.minimum(steps[-1] + 1, n_left)),
             discounts=gamma**n_steps * goes_on,
             mask=goes_on | terminated,
         )
@@ -222,16 +244,16 @@ class FlatSteps:
         shape = (len(ends), context_length, -1)
         valid = mask.unsqueeze(-1)
         batch = Windows(
-            observations=self.observations.index_select(0, rows).view(shape) * valid,
-            actions=self.actions.index_select(0, rows).view(shape) * valid,
-            returns_to_go=self.returns_to_go.index_select(0, rows).view(mask.shape) * mask,
+            observations=self.stored["observations"].index_select(0, rows).view(shape) * valid,
+            actions=self.stored["actions"].index_select(0, rows).view(shape) * valid,
+            returns_to_go=self.stored["returns_to_go"].index_select(0, rows).view(mask.shape) * mask,
             timesteps=timesteps.clamp_(min=0),
             mask=mask,
         )
         if n_ahead:
             ahead = th.arange(1, n_ahead + 1, device=last_rows.device)
             rows_ahead = last_rows.unsqueeze(1) + th.minimum(ahead, n_left.unsqueeze(1))
-            actions_ahead = self.actions.index_select(0, rows_ahead.flatten()).view(len(ends), n_ahead, -1)
+            actions_ahead = self.stored["actions"].index_select(0, rows_ahead.flatten()).view(len(ends), n_ahead, -1)
             batch = batch._replace(actions=th.cat((batch.actions, actions_ahead), dim=1))
         if self.device.type == rows.device.type:
             return batch

@@ -61,9 +61,7 @@ def inspect_buffer(buffer: TrajectoryBuffer) -> Inspection:
 
     :param buffer: as it would be learned from
     """
-    rows = buffer.rows
-    observations = _range(buffer.observations.index_select(0, rows))
-    values = buffer.actions.index_select(0, rows)
+    observations, values = _range(buffer.observations), buffer.actions
     actions = _range(values)
     low, high = (th.from_numpy(bound).to(values) for bound in bounds_of(vector_space(buffer.action_space)))
     margin = AT_BOUND * (high - low)
@@ -109,7 +107,8 @@ def explained_by_start(buffer: TrajectoryBuffer) -> float:
     :param buffer: of any number of episodes, of which those that are there twice count once
     :return: in [0, 1]; 0 for fewer than ten episodes
     """
-    starts = buffer.observations.index_select(0, th.from_numpy(buffer.episodes.starts).to(buffer.observations.device))
+    stored = buffer.stored["observations"]
+    starts = stored.index_select(0, th.from_numpy(buffer.episodes.starts).to(stored.device))
     table = np.unique(np.column_stack([buffer.episode_returns, starts.cpu()]), axis=0)
     table = table[np.linspace(0, len(table) - 1, min(len(table), MOST_STARTS)).astype(int)]
     deviations = table - table.mean(axis=0)

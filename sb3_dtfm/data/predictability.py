@@ -61,7 +61,7 @@ def correlation_of_changes(buffer: TrajectoryBuffer) -> float:
     rows = buffer.rows[later.to(buffer.rows.device)]
     low, high = (th.as_tensor(bound).double() for bound in bounds_of(vector_space(buffer.action_space)))
     oldest, previous, newest = (
-        buffer.actions.index_select(0, rows - back).cpu().double() / (high - low) for back in (2, 1, 0)
+        buffer.stored["actions"].index_select(0, rows - back).cpu().double() / (high - low) for back in (2, 1, 0)
     )
     before, after = previous - oldest, newest - previous
     size = (before.square().sum() * after.square().sum()).sqrt()
@@ -84,7 +84,8 @@ def prediction_errors(buffer: TrajectoryBuffer) -> PredictionErrors | None:
         return None
     rows = buffer.rows[chosen.to(buffer.rows.device)]
     low, high = (th.as_tensor(bound).double() for bound in bounds_of(vector_space(buffer.action_space)))
-    previous, actions = (buffer.actions.index_select(0, at).cpu().double() / (high - low) for at in (rows - 1, rows))
+    stored = buffer.stored["actions"]
+    previous, actions = (stored.index_select(0, at).cpu().double() / (high - low) for at in (rows - 1, rows))
     features = _features(buffer, rows, buffer.episode_returns[names][episode], generator)
     part = np.random.default_rng(0).permutation(len(names))[episode] % N_PARTS
 
@@ -102,11 +103,11 @@ def _features(
     """
     Regressors without and with the return: the observation, and random features of it alone and of it with the return.
 
-    :param rows: (N,) of the buffer's tensors
+    :param rows: (N,) of the stored tensors
     :param returns: (N,) of whole episodes
     :return: (N, F) each; without the return it counts as the mean one, so that both have the same number of features
     """
-    observations = buffer.statistics().normalize(buffer.observations.index_select(0, rows).cpu())
+    observations = buffer.statistics().normalize(buffer.stored["observations"].index_select(0, rows).cpu())
     weights = 2.0 * th.randn(observations.shape[1], N_FEATURES, generator=generator) / observations.shape[1] ** 0.5
     projected = observations @ weights + th.randn(N_FEATURES, generator=generator)
     return_weights = th.randn(N_FEATURES, generator=generator)

@@ -282,8 +282,17 @@ def test_select_shares_the_arrays_and_can_be_repeated():
     chosen = buffer.select(np.array([3, 0, 2])).select(np.array([2, 0]))
     assert chosen.rows.tolist() == [6, 7, 8, 9, 10, 11]
     for name in STEP_ARRAYS:
-        assert getattr(chosen, name).data_ptr() == getattr(buffer, name).data_ptr(), name
+        assert chosen.stored[name] is buffer.stored[name], name
     assert len(buffer) == 12
+
+
+def test_the_arrays_of_a_part_are_its_own_and_those_of_all_are_not_copied():
+    buffer = make_buffer([5, 1, 4, 2])
+    assert buffer.observations is buffer.stored["observations"]
+    chosen = buffer.select(np.array([2, 0]))
+    for name in ("observations", "actions", "rewards", "returns_to_go"):
+        th.testing.assert_close(getattr(chosen, name), buffer.stored[name][chosen.rows], rtol=0, atol=0)
+        assert len(getattr(chosen, name)) == len(chosen) < len(buffer)
 
 
 def test_windows_of_a_selection_are_those_of_a_buffer_of_these_episodes_alone():
@@ -317,7 +326,7 @@ def test_the_draw_of_a_full_buffer_is_one_randint_over_its_steps():
 @pytest.mark.parametrize("episodes", [*itertools.permutations(range(3), 2), (0, 1, 2)])
 def test_statistics_are_those_of_the_contained_steps(episodes: tuple[int, ...]):
     chosen = make_buffer([5, 1, 40]).select(np.array(episodes))
-    observations, to_go = chosen.observations[chosen.rows].double(), chosen.returns_to_go[chosen.rows]
+    observations, to_go = chosen.observations.double(), chosen.returns_to_go
     statistics = chosen.statistics()
     np.testing.assert_allclose(statistics.observation_mean, observations.mean(0), rtol=1e-6)
     np.testing.assert_allclose(statistics.observation_std, observations.std(0, correction=0), rtol=1e-6)

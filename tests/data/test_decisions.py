@@ -54,7 +54,7 @@ def test_a_planners_actions_are_drawn_in_chunks():
 
 def test_a_planners_noise_takes_robust_units():
     buffer = make_buffer("planner")
-    buffer.actions += 0.1 * th.randn(buffer.actions.shape, generator=th.Generator().manual_seed(0))
+    buffer.stored["actions"] += 0.1 * th.randn(buffer.actions.shape, generator=th.Generator().manual_seed(0))
     decided = settings(buffer)
     assert (decided["chunk_size"], decided["observation_scaling"]) == (8, "robust")
 

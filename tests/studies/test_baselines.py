@@ -94,10 +94,10 @@ def test_a_baseline_is_given_the_steps_that_ours_learn_from(datasets, buffer, tm
     assert [episode.terminated for episode in given.episodes] == expected.terminated.tolist()
     for name in ("observations", "rewards"):
         steps = np.concatenate([getattr(episode, name) for episode in given.episodes])
-        np.testing.assert_array_equal(steps, getattr(expected, name)[expected.rows].numpy())
+        np.testing.assert_array_equal(steps, getattr(expected, name).numpy())
     scaled = np.concatenate([episode.actions for episode in given.episodes])
     assert np.abs(scaled).max() <= 1.0
-    np.testing.assert_allclose(given.to_environment(scaled), expected.actions[expected.rows].numpy(), atol=1e-6)
+    np.testing.assert_allclose(given.to_environment(scaled), expected.actions.numpy(), atol=1e-6)
 
 
 def test_a_baseline_learns_and_acts_in_the_range_of_the_environment(tmp_path, buffer):
@@ -318,7 +318,7 @@ def test_d3rlpy_and_ours_read_the_same_of_a_file(tmp_path, buffer):
     buffer.save(tmp_path / "episodes.npz")
     settings = OTHERS["bc"].settings | {"hidden": [64, 64]}
     steps = load_dataset(tmp_path / "episodes.npz")
-    observations, actions = (getattr(steps, name)[steps.rows].numpy() for name in ("observations", "actions"))
+    observations, actions = (getattr(steps, name).numpy() for name in ("observations", "actions"))
     with BaselineProcess(PYTHONS["d3rlpy"], cells.WORKERS["d3rlpy"], tmp_path / "log") as process:
         process.train(tmp_path / "episodes.npz", settings, 0, 500, None)
         n = len(observations)
