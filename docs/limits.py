@@ -17,7 +17,8 @@ GENERATED = ("licences.md", "report.md")
 # The commit after which subjects follow CONTRIBUTING.
 SUBJECTS_SINCE = "8f2ec2e76aa61cf848541cb9fca7a28976c411f4"
 # Words that begin no imperative.
-NO_IMPERATIVE = re.compile(r"(A|An|The|Of|What|Who|Where|It|Its|This|That|There|\w+ing|\w+ed)\b")
+IMPERATIVE = "Bring|Embed|Exceed|Feed|Need|Proceed|Seed|Shed|Speed|Succeed"
+NO_IMPERATIVE = re.compile(rf"(?!({IMPERATIVE})\b)(A|An|The|Of|What|Who|Where|It|Its|This|That|There|\w+ing|\w+ed)\b")
 
 
 class Size(NamedTuple):
@@ -35,7 +36,7 @@ class Size(NamedTuple):
 def words(text: str, prose: bool = False) -> int:
     """Number of words; of prose alone, if asked for."""
     if prose:
-        text = re.sub(r"^(```|~~~).*?^\1", "", text, flags=re.DOTALL | re.MULTILINE)
+        text = re.sub(r"^[ \t]*(```|~~~).*?^[ \t]*\1", "", text, flags=re.DOTALL | re.MULTILINE)
         text = re.sub(r"^\s*\|.*$", "", text, flags=re.MULTILINE)
     return sum(any(letter.isalnum() for letter in word) for word in text.split())
 

@@ -148,7 +148,7 @@ class EvaluateAtStartAndEnd(BaseCallback):
         return True
 
     def _updates(self) -> int:
-        """The model's gradient steps: one that acts and learns in turns learns on after its last step."""
+        """The model's gradient steps: one that acts and learns in rounds learns on after its last step."""
         return getattr(self.model, "_n_updates", 0)
 
     def _on_training_end(self) -> None:

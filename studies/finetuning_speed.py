@@ -3,7 +3,7 @@ Steps a second that environments make alone, and behind what `sb3-dtfm finetune`
 
     OMP_NUM_THREADS=1 python studies/finetuning_speed.py --env robosuite/Lift-v0 --n-envs 1 2 --vec-env subproc -o rows.jsonl
 
-`attempts` are those that a DTFM makes to learn from them, `wrapped` chooses at random what an algorithm would, `learning` is
+`rollouts` are those of a DTFM that learns from them, `wrapped` chooses at random what an algorithm would, `learning` is
 the algorithm itself with its packaged settings. One thread for each process. The model has the packaged sizes and no
 training: what it computes is the same.
 """
@@ -106,7 +106,7 @@ class Timed:
 
 
 def measure(env_id: str, n_envs: int, vec_env: str, algo: str, seconds: float) -> Iterator[dict[str, Any]]:
-    """Rows: environments alone, attempts of a DTFM, what an algorithm learns in, and itself."""
+    """Rows: environments alone, rollouts of a DTFM, what an algorithm learns in, and itself."""
     about = {"task": env_id, "n_envs": n_envs, "vec_env": vec_env}
     envs = make_envs(env_id, n_envs, vec_env)
     envs.reset()
@@ -123,13 +123,13 @@ def measure(env_id: str, n_envs: int, vec_env: str, algo: str, seconds: float) -
     acting = Acting(model, envs)
     start = time.perf_counter()
     found = steps_per_second(acting.step, seconds)
-    yield {**about, "what": "attempts", "steps_per_s": round(found, 1), **timed.shares(time.perf_counter() - start)}
+    yield {**about, "what": "rollouts", "steps_per_s": round(found, 1), **timed.shares(time.perf_counter() - start)}
     envs.close()
     yield from ({**about, "algo": algo, **row} for row in measure_algorithm(algo, env_id, n_envs, vec_env, seconds))
 
 
 class Acting:
-    """A model that makes attempts, as it does to learn from them."""
+    """A model that makes rollouts, as it does to learn from them."""
 
     def __init__(self, model: DTFM, envs: VecEnv) -> None:
         self.model, self.envs = model, envs

@@ -280,7 +280,9 @@ def draw(folder: Path, path: Path) -> None:
     for y in range(len(names) - 1):
         axes.axhline(y + 0.5, color="0.9", zorder=0)
     axes.set(xscale="log", yticks=range(len(names)), yticklabels=names)
-    axes.set_xlabel("seconds on one core to 95 % of the best tenth of the recorded episodes (hollow: not reached)")
+    figure.supxlabel(
+        "seconds on one core to 95 % of the best tenth of the recorded episodes; hollow: not reached", fontsize="medium"
+    )
     axes.xaxis.set_major_formatter("{x:g}")
     axes.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
     figure.savefig(path, dpi=120)

@@ -133,11 +133,10 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
     action_space: ActionSpace
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """`help` of an algorithm lists all parameters, those of its policy and its head, too."""
+        """`help` of an algorithm with a policy of its own lists all parameters, those of policy and head, too."""
         super().__init_subclass__(**kwargs)
-        if "policy_aliases" in vars(cls):
-            policy = cls.policy_aliases[POLICY_NAMES[0]]
-            assert issubclass(policy, SequencePolicy)
+        policy = vars(cls).get("policy_aliases", {}).get(POLICY_NAMES[0])
+        if isinstance(policy, type) and issubclass(policy, SequencePolicy):
             head_options = set(policy.head_class.options())
             parts = [
                 inspect.cleandoc(cls.__doc__ or ""),

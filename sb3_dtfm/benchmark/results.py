@@ -60,7 +60,7 @@ def _json(text: str) -> dict[str, Any]:
 
 
 def _versions(text: str) -> dict[str, str]:
-    return dict(each.rsplit(" ", 1) for each in text.split("; "))
+    return dict(each.rsplit(" ", 1) for each in text.split("; ") if each)
 
 
 EXPECTED = {
@@ -159,14 +159,14 @@ def read_table(path: Path) -> list[Result]:
 
     :raises RowError: names the line that is wrong
     """
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8-sig") as file:
         reader = csv.reader(file)
         header = next(reader, [])
         if missing := [name for name in COLUMNS if name not in header]:
             cure = "`sb3-dtfm report FOLDER --csv FILE` writes such a table from the rows of a benchmark"
             raise RowError(f"{path}, line 1: lacks {', '.join(missing)}; expected are {', '.join(COLUMNS)}. {cure}.")
         results = []
-        for cells in reader:
+        for cells in filter(None, reader):  # a spreadsheet may leave an empty line
             try:
                 if len(cells) != len(header):
                     raise RowError(f"holds {len(cells)} values, expected {len(header)}, one for each column.")

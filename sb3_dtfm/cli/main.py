@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(argv)
     # Before torch starts its threads: by default they spin for milliseconds while they wait, which takes the time of a
     # simulator or another job on the same core. Threads that sleep at once wake up too late (docs/performance.md).
-    if "OMP_WAIT_POLICY" not in os.environ:
+    if "torch" not in sys.modules and "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     if options.command not in WITHOUT_RL_ZOO and importlib.util.find_spec("rl_zoo3") is None:
         return _fail(options.command, 'needs RL-Zoo: pip install "sb3-dtfm[zoo]"')

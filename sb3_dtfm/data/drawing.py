@@ -25,7 +25,8 @@ class FlatSteps:
     :param tensors: (N, ...) for each of `STEP_ARRAYS`
     :param episodes: the own ones, which need not be all that lie in the tensors
     :param maps: the tensors that are files, of those that windows hold
-    :ivar stored: the tensors, which buffers of other episodes share; the buffer's own steps lie at `rows`
+    :ivar stored: the tensors, which buffers of other episodes share; the buffer's own steps lie at `rows`. To read them,
+        take `observations`, `actions`, `rewards` and `returns_to_go`, which are the own ones alone
     """
 
     def __init__(self, tensors: dict[str, th.Tensor], episodes: EpisodeTable, maps: Sequence[MappedSteps] = ()) -> None:

@@ -58,7 +58,8 @@ def correlation_of_changes(buffer: TrajectoryBuffer) -> float:
     generator = th.Generator().manual_seed(0)
     later = th.nonzero(buffer.timesteps.cpu() >= 2).squeeze(1)
     later = later[th.randperm(len(later), generator=generator)[:MAX_STEPS].sort().values]
-    rows = buffer.rows[later.to(buffer.rows.device)]
+    rows = buffer.rows
+    rows = rows[later.to(rows.device)]
     low, high = (th.as_tensor(bound).double() for bound in bounds_of(vector_space(buffer.action_space)))
     oldest, previous, newest = (
         buffer.stored["actions"].index_select(0, rows - back).cpu().double() / (high - low) for back in (2, 1, 0)
@@ -82,7 +83,8 @@ def prediction_errors(buffer: TrajectoryBuffer) -> PredictionErrors | None:
     names, episode = np.unique(episode, return_inverse=True)
     if len(names) < 2:
         return None
-    rows = buffer.rows[chosen.to(buffer.rows.device)]
+    rows = buffer.rows
+    rows = rows[chosen.to(rows.device)]
     low, high = (th.as_tensor(bound).double() for bound in bounds_of(vector_space(buffer.action_space)))
     stored = buffer.stored["actions"]
     previous, actions = (stored.index_select(0, at).cpu().double() / (high - low) for at in (rows - 1, rows))

@@ -49,7 +49,7 @@ class OnlineDTFM(DTFM):
     """
     A DTFM that goes on imitating: its dataset, and those of its own episodes that succeeded.
 
-    It acts from fresh noise, so that no two attempts are alike; what worked is imitated, and works more often from then on.
+    It acts from fresh noise, so that no two rollouts are alike; successes are imitated, and become more frequent.
     Where the environment tells of no success, an episode is imitated that returned at least as much as the average of
     dataset and own episodes so far. With a critic (`critic_steps` among the `policy_kwargs`) all episodes teach the critic,
     failures too, and the critic chooses among `n_action_samples` draws.
@@ -71,7 +71,7 @@ class OnlineDTFM(DTFM):
         self._running: list[Step] = []  # of the episodes that have not ended
         self._began: list[int] = []  # where each environment's episode begins in them
         self._state: tuple[np.ndarray, ...] | None = None  # of acting
-        self._n_left = 0  # of a turn's gradient steps
+        self._n_left = 0  # of a round's gradient steps
         super().__init__(*args, **kwargs)
 
     def _check_arguments(self, learning_rate: Rule) -> None:
@@ -95,7 +95,7 @@ class OnlineDTFM(DTFM):
         return total_timesteps, callback
 
     def _schedule_position(self) -> tuple[int, float]:
-        """Each turn has the whole schedule: what a turn has changed settles before the next episodes."""
+        """Each round has the whole schedule: its changes settle before the next episodes."""
         n_learned = self.gradient_steps - self._n_left
         return n_learned, n_learned / self.gradient_steps
 
@@ -109,7 +109,7 @@ class OnlineDTFM(DTFM):
         progress_bar: bool = False,
     ) -> SelfOnlineDTFM:
         """
-        Act and learn in turns; callbacks run once after each step of the environments.
+        Act and learn in rounds; callbacks run once after each step of the environments.
 
         :param total_timesteps: steps of all environments together
         :param callback: SB3 callback or list of callbacks
@@ -132,17 +132,17 @@ class OnlineDTFM(DTFM):
         parallel = DataParallel(self.policy, self._loss_function(), self.batch_size)
         self._training_seed = self._choose_training_seed()
         callback.on_training_start(locals(), globals())
-        if self._n_left and self.replay_buffer is not None:  # of a turn that was interrupted
+        if self._n_left and self.replay_buffer is not None:  # of a round that was interrupted
             self._imitate(parallel, min(self._n_left, self.gradient_steps))
-        n_turns = 0
+        n_rounds = 0
         while self.num_timesteps < total_timesteps:
-            # Of a turn's beginning: it ends with an episode, and the last one so beyond the steps that were asked for.
+            # At the beginning of a round: it ends with an episode, and the last one so beyond the steps that were asked for.
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
             if not self._collect(callback):
                 break
             self._imitate(parallel, self.gradient_steps)
-            n_turns += 1
-            if log_interval and n_turns % log_interval == 0:
+            n_rounds += 1
+            if log_interval and n_rounds % log_interval == 0:
                 self.dump_logs()
         self._check_finite(self._means.sums(), self._means.n_values)
         callback.on_training_end()
@@ -235,7 +235,7 @@ class OnlineDTFM(DTFM):
 
     def _imitate(self, parallel: DataParallel, n_steps: int) -> None:
         """
-        The gradient steps of a turn; what acting has kept of the old weights' keys and values goes.
+        The gradient steps of a round; what acting has kept of the old weights' keys and values goes.
 
         :param n_steps: less than `gradient_steps` where others have been taken before an interrupt
         """

@@ -96,6 +96,7 @@ class FlatAdamW(th.optim.AdamW):
         self._moments: dict[str, FlatTensors] = {}
         self._memory: th.Tensor | None = None
         self._parts_of_memory: list[th.Tensor] = []  # one for each parameter
+        self._clipped_parts_of_memory: list[th.Tensor] = []
         self._gradient: th.Tensor | None = None  # clipped, for the next step
         self._is_even = True  # all parameters have had as many steps
         self._clipped_parameters = [parameter for parameter in self.parameters if id(parameter) not in apart]
@@ -123,10 +124,11 @@ class FlatAdamW(th.optim.AdamW):
         gradient = self._flat_gradient()
         if gradient is None:
             return nn.utils.clip_grad_norm_(self._clipped_parameters, max_norm)
-        self._gradient, clipped = gradient, gradient[self._clipped]
-        norm = clipped.norm()
+        self._gradient = gradient
+        norm = gradient[self._clipped].norm()
         if max_norm < math.inf:
-            clipped.mul_((max_norm / (norm + 1e-6)).clamp(max=1.0))
+            # Not the zeros in between, which a norm that is not finite would fill with NaN for good.
+            th._foreach_mul_(self._clipped_parts_of_memory, (max_norm / (norm + 1e-6)).clamp(max=1.0))
             for parameter, part in zip(self.parameters, self._parts_of_memory, strict=True):
                 parameter.grad = part
         return norm
@@ -162,6 +164,9 @@ class FlatAdamW(th.optim.AdamW):
         if self._memory is None or self._memory.device != weights.device:
             self._memory = th.zeros_like(weights)
             self._parts_of_memory = self._weights.views(self._memory)
+            clipped = {id(parameter) for parameter in self._clipped_parameters}
+            parts = zip(self.parameters, self._parts_of_memory, strict=True)
+            self._clipped_parts_of_memory = [part for parameter, part in parts if id(parameter) in clipped]
         th._foreach_copy_(self._parts_of_memory, gradients)  # type: ignore[arg-type]
         return self._memory
 

@@ -284,7 +284,7 @@ class OnlineManager(FinetuningManager):
         if not self.has_checkpoint:
             self.trained_agent, self.continue_training = str(self.base_file), True
         self.save_replay_buffer = False  # it is, as episodes.npz
-        self.signals.between_steps = False  # of which a turn has many, and none is repeated to the bit anyway
+        self.signals.between_steps = False  # of which a round has many, and none is repeated to the bit anyway
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """

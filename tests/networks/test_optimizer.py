@@ -94,6 +94,20 @@ def test_a_step_that_is_not_finite_changes_nothing():
     assert {float(state["step"]) for state in ours.state.values()} == {0.0}
 
 
+def test_a_gradient_that_is_not_finite_leaves_no_trace_in_the_next_ones():
+    """Nor in the memory between those of two parameters, which the norm counts."""
+    network = make_network()
+    ours, _, _ = make_optimizers(network)
+    norms = []
+    for wrong in (0.0, th.nan, 0.0):
+        ours.zero_grad()
+        backward(network, 0)
+        network[0].bias.grad[0] += wrong
+        norms.append(float(ours.clip_gradient(1.0)))
+    assert norms[1] != norms[1]
+    assert norms[2] == norms[0]
+
+
 @pytest.mark.parametrize("change", ["moved", "loaded"])
 def test_memory_that_was_replaced_is_laid_out_again(change):
     network = make_network()

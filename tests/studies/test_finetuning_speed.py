@@ -8,7 +8,7 @@ import pytest
 def test_environments_are_timed_alone_and_behind_a_wrapper(algo):
     rows = list(finetuning_speed.measure("HalfCheetah-v5", 2, "dummy", algo, 0.3))
     measured = [(row["what"], row.get("algo")) for row in rows]
-    assert measured == [("bare", None), ("attempts", None), ("wrapped", algo), ("learning", algo)]
+    assert measured == [("bare", None), ("rollouts", None), ("wrapped", algo), ("learning", algo)]
     bare, *behind = (row["steps_per_s"] for row in rows)
     assert 0 < max(behind) < bare
     for row in rows[1:]:
