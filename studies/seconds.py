@@ -45,7 +45,7 @@ import matplotlib.pyplot as plt  # noqa: E402
 from filelock import FileLock, Timeout  # noqa: E402
 
 HERE = Path(__file__).parent
-DATA = ("hopper", "hopper-ladder", "inverted-double-pendulum", "hammer", "relocate", "stack-50")
+DATA = ("hammer", "hopper", "hopper-ladder", "inverted-double-pendulum", "mountain-car", "relocate")
 OURS = (*BASELINES, *ALGORITHMS)
 NAMES = {
     "bc": "BC",
@@ -192,28 +192,18 @@ def kind(job: Job) -> str:
     return "manipulation" if task.startswith("robosuite") else "hand" if task.startswith("AdroitHand") else "locomotion"
 
 
-def planned(options: argparse.Namespace, data: str, algo: str, seed: int) -> list[Job]:
-    """The grid's job of a cell; none if it is finished."""
-    arguments = [
-        "--datasets",
-        str(HERE / "suite.yml"),
-        "--env",
-        data,
-        "--algo",
-        algo,
-        "--fractions",
-        "1",
-        "--seeds",
-        str(seed),
-    ]
+def planned(options: argparse.Namespace, data: str, algo: str, seed: int) -> Job:
+    """The grid's job of a cell, whatever results there are."""
+    arguments = f"--datasets {HERE / 'suite.yml'} --env {data} --algo {algo} --fractions 1 --seeds {seed}".split()
     changes = ["-params", *options.hyperparams] if options.hyperparams else []
     more = ["-n", str(options.steps), "--label", options.label, *changes, "-o", "nowhere"]
-    return plan(parse_arguments([*arguments, *more]))[0]
+    (job,), _ = plan(parse_arguments([*arguments, *more]))
+    return job
 
 
 def run_cell(options: argparse.Namespace, data: str, algo: str, seed: int, path: Path) -> None:
     """One cell, in this process."""
-    (job,) = planned(options, data, algo if algo in OURS else "dt", seed)
+    job = planned(options, data, algo if algo in OURS else "dt", seed)
     if algo in OURS:
         cell = run_here(job)
     else:

@@ -60,7 +60,7 @@ class Level(Demonstrator):
 
 
 class Missing(Demonstrator):
-    """Its first grasp closes above or beside the object every other time; it looks again, and residual that."""
+    """Its first grasp closes above or beside the object every other time; it looks again, and corrects that."""
 
     def reset(self) -> None:
         super().reset()

@@ -55,7 +55,7 @@ def _parser() -> argparse.ArgumentParser:
         add_help=False,
         usage="sb3-dtfm finetune --model MODEL --env ENV [options] [RL-Zoo options]",
         description="Go on learning online: a DTFM from its own episodes (--algo dtfm), or an SB3 algorithm "
-        "that chooses the noise of a frozen one, or residual its actions.",
+        "that chooses the noise of a frozen one, or adds residual actions to its own.",
         epilog=f"examples:\n{EXAMPLES}\nRL-Zoo's own options follow.\n",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

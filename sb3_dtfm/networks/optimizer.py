@@ -73,6 +73,7 @@ class FlatAdamW(th.optim.AdamW):
     add_param_group = inspect.unwrap(th.optim.Optimizer.add_param_group)
     state_dict = inspect.unwrap(th.optim.Optimizer.state_dict)
     load_state_dict = inspect.unwrap(th.optim.Optimizer.load_state_dict)
+    _drop_gradients = inspect.unwrap(th.optim.Optimizer.zero_grad)
 
     # Of a gradient step that changes nothing 1, else 0; a GPU decides by it without a host that waits.
     found_inf: th.Tensor | None = None
@@ -111,7 +112,7 @@ class FlatAdamW(th.optim.AdamW):
 
     def zero_grad(self, set_to_none: bool = True) -> None:
         """torch's."""
-        inspect.unwrap(th.optim.Optimizer.zero_grad)(self, set_to_none)
+        self._drop_gradients(set_to_none)
         self._gradient = None
 
     def clip_gradient(self, max_norm: float) -> th.Tensor:

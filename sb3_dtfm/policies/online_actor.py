@@ -62,7 +62,7 @@ class OnlineActor(nn.Module):
     :param squashed: it chooses bound * tanh(...), as SAC's and TQC's actions; otherwise clipped to the bound, as PPO's
     :param bound: largest absolute noise, or residual action in units of [-1, 1]
     :param hidden_state: the trunk's hidden state is part of what it sees
-    :param residual: it residual actions, and sees them behind the rest; otherwise it chooses noise
+    :param residual: it adds residual actions, and sees the policy's own behind the rest; otherwise it chooses noise
     :raises ValueError: an argument out of range, by name
     """
 

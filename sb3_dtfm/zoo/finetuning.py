@@ -1,4 +1,4 @@
-"""RL-Zoo's experiments that go on from a DTFM: noise-space RL, residual RL, or DTFM's own online fine-tuning."""
+"""RL-Zoo's experiments that start from a DTFM: noise-space RL, residual RL, or DTFM's own online fine-tuning."""
 
 import inspect
 import os
@@ -147,7 +147,7 @@ class FinetuningManager(OfflineExperimentManager):
         if known.get("vec_env_wrapper") and "vec_env_wrapper" not in self.of_the_data:
             raise UsageError(
                 f"--model {self.base}: it learned in {known['vec_env_wrapper']}, where an online algorithm needs a "
-                "NoiseActionVecEnv or ResidualActionVecEnv; --algo dtfm goes on in it."
+                "NoiseActionVecEnv or ResidualActionVecEnv; --algo dtfm continues in it."
             )
         from_the_run = ["env_wrapper", *([] if self.env_kwargs else ["env_kwargs"])]  # of the command line, if given there
         from_the_run += self.of_the_data
@@ -187,7 +187,7 @@ class FinetunedManager(FinetuningManager):
         hyperparams, _ = super().read_hyperparameters()
         key, arguments = self._frozen_env(hyperparams)
         residual = FROZEN_ENVS[key] is ResidualActionVecEnv
-        print(f"{self.algo.upper()} {'residual the actions' if residual else 'chooses the noise'} of {self.base}")
+        print(f"{self.algo.upper()} {'adds residual actions to those' if residual else 'chooses the noise'} of {self.base}")
         keep_one_action(self.finetuned.policy, residual)
         saved = {name: value for name, value in hyperparams.items() if name != "vec_env_wrapper"}
         saved[key] = {**arguments, "algorithm": self.algo, "model": str(self.base_file)}

@@ -193,7 +193,7 @@ def _milliseconds(times: list[float]) -> float:
 
 
 def _act(learner: Learner, dataset: Dataset, questions: BinaryIO, answers: BinaryIO, not_learning: float = 0.0) -> None:
-    """Answer with actions until nobody asks, and learn in between if asked to."""
+    """Answer with actions until the other side is gone, and learn in between if asked to."""
     actors: list[Callable[[np.ndarray, float, bool], np.ndarray]] = []
     times: list[float] = []
     while True:

@@ -176,7 +176,7 @@ def test_ppo_corrects_a_zip_file_with_a_target_of_its_own(run, workplace, capsys
     assert model.online_actor["residual"]
     assert model.policy.n_action_steps == 1
     output = capsys.readouterr().out
-    assert "PPO residual the actions of alone.zip" in output
+    assert "PPO adds residual actions to those of alone.zip" in output
     assert "n_action_steps=2 becomes 1: a residual action is added to each action" in output
     settings = yaml.unsafe_load((finetuned / "HalfCheetah-v5/config.yml").read_text())
     assert settings["residual_env"]["bound"] == 0.5

@@ -68,7 +68,7 @@ def test_the_same_seed_gives_the_same_numbers(buffer):
 
 
 def test_some_of_the_episodes_are_learned_from_alone(buffer):
-    """Without the winners nobody who goes by -1 earns anything, and the others' numbers are not touched."""
+    """Without the winners no episode that goes by -1 earns anything, and the others' numbers are not touched."""
     chosen = np.array([i for i in range(N_EPISODES) if i % 20 != 1])
     changed = buffer.select(chosen).with_expected_returns(1, seed=0)
     np.testing.assert_allclose(by_episode(changed)[chosen % 2 == 1, 0], 0.0, atol=0.4)
