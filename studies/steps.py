@@ -68,7 +68,7 @@ SMALL = dict(
 )  # fmt: skip
 WIDE = dict(SMALL, flow_hidden_dim=512, dropout=0.1)
 PAPER = dict(WIDE, embed_dim=256, n_layers=10)
-# Sizes that papers and other libraries use. For a version before d2bb744, with other option names, take 14f85c9's steps.py.
+# Sizes that papers and other libraries use. For a version before 581be92, with other option names, take f478840's steps.py.
 SIZES: dict[str, Step] = {
     "width 128 x 3, one step, batch 64": Step("dtfm", 17, 6, 64, 1, dict(SMALL, dropout=0.2)),
     "the same, chunks of 8": Step("dtfm", 29, 7, 64, 1, dict(SMALL, dropout=0.0, chunk_size=8)),
