@@ -18,7 +18,8 @@ import torch as th
 from sb3_dtfm import DTFM
 from sb3_dtfm.benchmark.evaluation import FINAL_STATES, evaluate, make_seeded_envs
 from sb3_dtfm.policies import SequencePolicy
-from sb3_dtfm.windows import Context, Windows
+from sb3_dtfm.policies.context import Context
+from sb3_dtfm.windows import Windows
 
 N_EPISODES, N_ENVS = 100, 10
 SETTINGS = {"env_wrapper": [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 1.0}}]}

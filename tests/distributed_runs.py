@@ -17,7 +17,7 @@ from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.distributed import local_rank_zero_first
 from sb3_dtfm.networks import trunk
-from sb3_dtfm.networks.cpu import dropout
+from sb3_dtfm.networks.layers import dropout
 from tests.conftest import PLAIN, TINY_FLOW_POLICY, TINY_POLICY
 
 CHUNKS = {

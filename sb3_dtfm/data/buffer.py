@@ -21,6 +21,7 @@ from sb3_dtfm.data.short_episodes import ShortEpisodes
 from sb3_dtfm.data.storage import STEP_ARRAYS, FileStorage, MappedSteps, MemoryStorage
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, returns_to_go
 from sb3_dtfm.files import replacing
+from sb3_dtfm.windows import Transitions
 
 
 def with_npz(path: str | os.PathLike[str]) -> Path:
@@ -253,6 +254,46 @@ class TrajectoryBuffer(FlatSteps):
                 n_summed *= 2
             largest = max(largest, float(np.abs(to_go).max()))
         return largest
+
+    def sample_transitions(
+        self, batch_size: int, n_steps: int, gamma: float, generator: th.Generator | None = None
+    ) -> Transitions:
+        """
+        Steps of any episode with equal probability, and where they and those after them led to.
+
+        :param batch_size: B
+        :param n_steps: h, steps that count as one
+        :param gamma: discount of a step
+        :param generator: source of randomness
+        """
+        return self.transitions(self._draw(batch_size, generator), n_steps, gamma)
+
+    def transitions(self, positions: th.Tensor, n_steps: int, gamma: float) -> Transitions:
+        """
+        The steps at the given positions, and where they and those after them led to; actions in the environment's range.
+
+        Behind an episode's end its last action stands again and again, as in :meth:`windows`.
+
+        :param positions: (B,) int64 among the buffer's own steps, episode after episode
+        :param n_steps: h, steps that count as one
+        :param gamma: discount of a step
+        """
+        positions = positions.to(self._stops.device)
+        rows, _, n_left = self._locate(positions)
+        terminated = self._terminated[th.searchsorted(self._stops, positions, right=True)]
+        steps = th.arange(n_steps, device=rows.device)
+        ahead = (rows.unsqueeze(1) + th.minimum(steps, n_left.unsqueeze(1))).flatten()
+        discounted = self.stored["rewards"].index_select(0, ahead).view(-1, n_steps) * gamma**steps
+        goes_on = n_left >= n_steps
+        batch = Transitions(
+            observations=self.stored["observations"].index_select(0, rows),
+            actions=self.stored["actions"].index_select(0, ahead).view(len(rows), -1),
+            rewards=(discounted * (steps <= n_left.unsqueeze(1))).sum(dim=1),
+            next_observations=self.stored["observations"].index_select(0, rows + th.minimum(steps[-1] + 1, n_left)),
+            discounts=gamma**n_steps * goes_on,
+            mask=goes_on | terminated,
+        )
+        return Transitions(*(tensor.to(self.device) for tensor in batch))
 
     def check_task(self, env_id: str) -> None:
         """

@@ -1,4 +1,4 @@
-"""Flat tensors of steps, where episodes lie in them, and how windows and transitions are drawn."""
+"""Flat tensors of steps, where episodes lie in them, and how windows are drawn."""
 
 import copy
 import itertools
@@ -10,7 +10,7 @@ import torch as th
 
 from sb3_dtfm.data.episodes import EpisodeTable
 from sb3_dtfm.data.storage import STEP_ARRAYS, MappedSteps
-from sb3_dtfm.windows import Transitions, Windows
+from sb3_dtfm.windows import Windows
 
 SelfSteps = TypeVar("SelfSteps", bound="FlatSteps")
 
@@ -162,46 +162,6 @@ class FlatSteps:
         :param generator: source of randomness
         """
         return self.windows(self._draw(batch_size, generator), context_length)
-
-    def sample_transitions(
-        self, batch_size: int, n_steps: int, gamma: float, generator: th.Generator | None = None
-    ) -> Transitions:
-        """
-        Steps of any episode with equal probability, and where they and those after them led to.
-
-        :param batch_size: B
-        :param n_steps: h, steps that count as one
-        :param gamma: discount of a step
-        :param generator: source of randomness
-        """
-        return self.transitions(self._draw(batch_size, generator), n_steps, gamma)
-
-    def transitions(self, positions: th.Tensor, n_steps: int, gamma: float) -> Transitions:
-        """
-        The steps at the given positions, and where they and those after them led to; actions in the environment's range.
-
-        Behind an episode's end its last action stands again and again, as in :meth:`windows`.
-
-        :param positions: (B,) int64 among the buffer's own steps, episode after episode
-        :param n_steps: h, steps that count as one
-        :param gamma: discount of a step
-        """
-        positions = positions.to(self._stops.device)
-        rows, _, n_left = self._locate(positions)
-        terminated = self._terminated[th.searchsorted(self._stops, positions, right=True)]
-        steps = th.arange(n_steps, device=rows.device)
-        ahead = (rows.unsqueeze(1) + th.minimum(steps, n_left.unsqueeze(1))).flatten()
-        discounted = self.stored["rewards"].index_select(0, ahead).view(-1, n_steps) * gamma**steps
-        goes_on = n_left >= n_steps
-        batch = Transitions(
-            observations=self.stored["observations"].index_select(0, rows),
-            actions=self.stored["actions"].index_select(0, ahead).view(len(rows), -1),
-            rewards=(discounted * (steps <= n_left.unsqueeze(1))).sum(dim=1),
-            next_observations=self.stored["observations"].index_select(0, rows + th.minimum(steps[-1] + 1, n_left)),
-            discounts=gamma**n_steps * goes_on,
-            mask=goes_on | terminated,
-        )
-        return Transitions(*(tensor.to(self.device) for tensor in batch))
 
     def _episode_weights(self, return_weighting: float) -> th.Tensor:
         """(E,) float32, with what probability an episode is drawn, up to a factor: by its length, its weight, its return."""

@@ -13,8 +13,8 @@ from sb3_dtfm.algorithms.offline import OfflineSequenceAlgorithm
 from sb3_dtfm.arguments import POSITIVE, check_arguments
 from sb3_dtfm.envs import BETWEEN, OBSERVATION, RETURN_TO_GO, TIMESTEP, check_vec_env, share_target_return
 from sb3_dtfm.policies import SequencePolicy
+from sb3_dtfm.policies.context import Context
 from sb3_dtfm.policies.normalization import OBSERVATION_CLIP
-from sb3_dtfm.windows import Context
 
 
 class FrozenPolicyVecEnv(VecEnvWrapper):

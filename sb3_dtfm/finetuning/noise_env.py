@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_dtfm.algorithms.offline import OfflineSequenceAlgorithm
 from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
 from sb3_dtfm.policies import SequencePolicy
-from sb3_dtfm.windows import Context
+from sb3_dtfm.policies.context import Context
 
 # Largest noise in a dimension, as in DSRL (Wagenmaker et al., 2025).
 NOISE_BOUND = 1.5

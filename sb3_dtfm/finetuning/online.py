@@ -21,7 +21,8 @@ from sb3_dtfm.distributed import DataParallel, n_processes
 from sb3_dtfm.envs import OBSERVATION, return_to_go_space
 from sb3_dtfm.envs.success import reported_success
 from sb3_dtfm.optimization import OWN_BATCHES, RunningMeans
-from sb3_dtfm.windows import Context, Transitions, Windows
+from sb3_dtfm.policies.context import Context
+from sb3_dtfm.windows import Transitions, Windows
 
 SelfOnlineDTFM = TypeVar("SelfOnlineDTFM", bound="OnlineDTFM")
 

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 from sb3_dtfm.algorithms.offline import OfflineSequenceAlgorithm
 from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
 from sb3_dtfm.policies import SequencePolicy
-from sb3_dtfm.windows import Context
+from sb3_dtfm.policies.context import Context
 
 # Of actions between -1 and 1.
 RESIDUAL_BOUND = 0.5

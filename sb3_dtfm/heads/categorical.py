@@ -3,7 +3,7 @@
 import torch as th
 
 from sb3_dtfm.heads.base import ActionHead, masked_mean
-from sb3_dtfm.networks.cpu import Linear
+from sb3_dtfm.networks.layers import Linear
 
 
 class CategoricalHead(ActionHead):

@@ -12,7 +12,7 @@ from torch import nn
 from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, POSITIVE, Choice, Number, Rule, check_arguments
 from sb3_dtfm.heads.base import ActionHead, masked_mean
 from sb3_dtfm.heads.regression import RegressionHead
-from sb3_dtfm.networks.film import FilmNetwork, VectorField
+from sb3_dtfm.networks.layers import FilmNetwork, VectorField
 from sb3_dtfm.networks.solvers import SOLVERS, integrate, solver_times
 
 # Not an ODE solver: a network of its own that has learnt where the solver would end.

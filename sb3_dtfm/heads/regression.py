@@ -4,7 +4,7 @@ import torch as th
 
 from sb3_dtfm.heads.base import ActionHead, masked_mean
 from sb3_dtfm.heads.categorical import CategoricalHead
-from sb3_dtfm.networks.cpu import Linear
+from sb3_dtfm.networks.layers import Linear
 
 
 class RegressionHead(ActionHead):

@@ -3,7 +3,7 @@
 import torch as th
 from torch import nn
 
-from sb3_dtfm.networks.cpu import Linear
+from sb3_dtfm.networks.layers import Linear
 
 HIDDEN_DIM = 256
 # The lower and the upper expectile: 0.5 would be the mean twice, 0 and 1 the extremes.

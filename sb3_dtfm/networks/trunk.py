@@ -6,8 +6,7 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_dtfm.networks.cpu import Linear, dropout, dropout_add, normal_
-from sb3_dtfm.networks.film import ReturnFilm
+from sb3_dtfm.networks.layers import Linear, ReturnFilm, dropout, dropout_add, normal_
 
 ALL = slice(None)
 
@@ -37,28 +36,15 @@ class TransformerBlock(nn.Module):
         normed, width = self.attention_norm(tokens), tokens.shape[-1]
         weight, bias = self.attention_in.weight, self.attention_in.bias
         if attention_bias is None:
-            return self._finish(tokens, self._drop_heads(F.linear(normed, weight[2 * width :], bias[2 * width :])))
+            return self.finish(tokens, self._drop_heads(F.linear(normed, weight[2 * width :], bias[2 * width :])))
         if queries == ALL:
             query, key, value = self.attention_in(normed).split(width, dim=-1)
         else:
             query = F.linear(normed[:, queries], weight[:width], bias[:width])
             key, value = F.linear(normed, weight[width:], bias[width:]).split(width, dim=-1)
-        return self._finish(tokens[:, queries], self._attend(query, key, value, attention_bias[:, :, queries]))
+        return self.finish(tokens[:, queries], self.attend(query, key, value, attention_bias[:, :, queries]))
 
-    def extend(self, tokens: th.Tensor, keys_values: th.Tensor, attention_bias: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """
-        Compute new tokens only, from the keys and values of all.
-
-        :param tokens: (B, N, D), the new ones
-        :param keys_values: (B, 2, L, D); those of the last N tokens are filled in, see :func:`fill_in`
-        :param attention_bias: (B, heads, N, L)
-        :return: (B, N, D), and the keys and values (B, 2, L, D)
-        """
-        query, key, value = self.attention_in(self.attention_norm(tokens)).split(tokens.shape[-1], dim=-1)
-        keys_values = fill_in(keys_values, key, value)
-        return self._finish(tokens, self._attend(query, keys_values[:, 0], keys_values[:, 1], attention_bias)), keys_values
-
-    def _attend(self, query: th.Tensor, key: th.Tensor, value: th.Tensor, attention_bias: th.Tensor) -> th.Tensor:
+    def attend(self, query: th.Tensor, key: th.Tensor, value: th.Tensor, attention_bias: th.Tensor) -> th.Tensor:
         """Attend from queries, (B, Q, D), to all keys and values, (B, L, D): (B, Q, D)."""
         dropout_p = self.dropout if self.training else 0.0
         query, key, value = (x.unflatten(-1, (self.n_heads, -1)).transpose(1, 2) for x in (query, key, value))
@@ -71,28 +57,11 @@ class TransformerBlock(nn.Module):
         weights = dropout(value.new_ones(len(value), 1, self.n_heads, 1), self.dropout, self.training)
         return (weights * value.unflatten(-1, (self.n_heads, -1))).flatten(start_dim=2)
 
-    def _finish(self, tokens: th.Tensor, attended: th.Tensor) -> th.Tensor:
+    def finish(self, tokens: th.Tensor, attended: th.Tensor) -> th.Tensor:
         """The residual paths of tokens and of what they attended to, (B, Q, D) each; then the MLP."""
         tokens = dropout_add(tokens, self.attention_out(attended), self.dropout, self.training)
         mapped = self.mlp_out(F.gelu(self.mlp_in(self.mlp_norm(tokens))))
         return dropout_add(tokens, mapped, self.dropout, self.training)
-
-
-def fill_in(keys_values: th.Tensor, key: th.Tensor, value: th.Tensor) -> th.Tensor:
-    """
-    Keys and values with those of the last N tokens: in place, but for a graph, which has no memory to write into.
-
-    :param keys_values: (B, 2, L, D)
-    :param key: (B, N, D)
-    :param value: (B, N, D)
-    :return: (B, 2, L, D)
-    """
-    n_new = key.shape[1]
-    if th.compiler.is_compiling():
-        return th.cat((keys_values[:, :, :-n_new], th.stack((key, value), dim=1)), dim=2)
-    keys_values[:, 0, -n_new:] = key
-    keys_values[:, 1, -n_new:] = value
-    return keys_values
 
 
 def attention(query: th.Tensor, key: th.Tensor, value: th.Tensor, bias: th.Tensor, dropout_p: float) -> th.Tensor:
@@ -201,54 +170,21 @@ class SequenceTrunk(nn.Module):
         :param last_only: compute the newest step's hidden state alone
         :return: (B, K, D) hidden states, (B, 1, D) with `last_only`
         """
-        tokens = self._tokens(observations, actions, returns_to_go, timesteps, mask)
+        tokens = self.embed(observations, actions, returns_to_go, timesteps, mask)
         tokens = dropout(tokens, self.dropout, self.training)
-        attention_bias = None if tokens.shape[1] == 1 else self._attention_bias(mask, tokens.shape[1])
-        films = self._films(returns_to_go)
+        attention_bias = None if tokens.shape[1] == 1 else self.attention_bias(mask, tokens.shape[1])
+        films = self.films(returns_to_go)
         *lower_blocks, last_block = self.blocks
         for block, film in zip(lower_blocks, films, strict=False):
             tokens = block(scale_and_shift(tokens, film), attention_bias)
         tokens = scale_and_shift(tokens, films[-1])
         return self.final_norm(last_block(tokens, attention_bias, slice(-1, None) if last_only else self.observation_tokens))
 
-    def extend(
-        self,
-        observations: th.Tensor,
-        actions: th.Tensor,
-        returns_to_go: th.Tensor,
-        timesteps: th.Tensor,
-        mask: th.Tensor,
-        keys_values: th.Tensor,
-    ) -> tuple[th.Tensor, list[th.Tensor]]:
-        """
-        The newest step's hidden state from what earlier steps left behind: one step's tokens instead of a whole window's.
-
-        Three new tokens are the last action, the return-to-go and the observation. They attend to the same steps as in
-        :meth:`forward`; but a kept step was itself computed with the steps before it, which reach back further than
-        this window once it slides. Equal to :meth:`forward` for the first K steps of an episode, and to attention with a
-        band of K steps over the whole episode from then on.
-
-        :param observations: (B, K, O), and the others as for :meth:`forward`; the last two steps are read
-        :param keys_values: (B, layers, 2, L, D) for the L tokens of K steps (:meth:`n_tokens`), any finite number where
-            `mask` is False; those of the last `tokens_per_step` tokens are filled in, see :func:`fill_in`
-        :return: (B, D) hidden state, and the keys and values of each layer, (B, 2, L, D)
-        """
-        newest = (x[:, -2:] for x in (observations, actions, returns_to_go, timesteps, mask))
-        tokens = self._tokens(*newest)[:, -self.tokens_per_step :]
-        attention_bias = self._attention_bias(mask, keys_values.shape[3])[:, :, -self.tokens_per_step :]
-        films = self._films(returns_to_go[:, -2:])
-        filled = list(keys_values.unbind(dim=1))
-        for i, (block, film) in enumerate(zip(self.blocks, films, strict=True)):
-            assert isinstance(block, TransformerBlock)
-            newest_film = None if film is None else film[:, -self.tokens_per_step :]
-            tokens, filled[i] = block.extend(scale_and_shift(tokens, newest_film), filled[i], attention_bias)
-        return self.final_norm(tokens[:, -1]), filled
-
     def n_tokens(self, context_length: int) -> int:
         """Tokens of a window of K steps; of three a step the last action's is left out, since nothing attends to it."""
         return context_length if self.tokens_per_step == 1 else self.tokens_per_step * context_length - 1
 
-    def _tokens(
+    def embed(
         self,
         observations: th.Tensor,
         actions: th.Tensor,
@@ -267,7 +203,7 @@ class SequenceTrunk(nn.Module):
         action = self.embed_action(actions)
         return th.stack((return_to_go, observation + time, action + time), dim=2).flatten(1, 2)[:, :-1]
 
-    def _films(self, returns_to_go: th.Tensor) -> Sequence[th.Tensor | None]:
+    def films(self, returns_to_go: th.Tensor) -> Sequence[th.Tensor | None]:
         """From returns-to-go (B, N) to scales and shifts (B, L, 2 D) of each block's tokens, None where there are none."""
         if self.film is None:
             return [None] * self.n_layers
@@ -282,7 +218,7 @@ class SequenceTrunk(nn.Module):
             return th.zeros_like(timesteps, dtype=self.final_norm.weight.dtype).unsqueeze(-1)
         return self.embed_timestep(timesteps.clamp(max=self.embed_timestep.num_embeddings - 1))
 
-    def _attention_bias(self, mask: th.Tensor, n_tokens: int) -> th.Tensor:
+    def attention_bias(self, mask: th.Tensor, n_tokens: int) -> th.Tensor:
         """From the steps' mask, (B, K), to what is added to the scores of their first tokens, (B, heads, L, L)."""
         allowed = causal_mask(mask.repeat_interleave(self.tokens_per_step, dim=1)[:, :n_tokens])
         bias = th.zeros_like(allowed, dtype=self.final_norm.weight.dtype).masked_fill_(~allowed, -th.inf)

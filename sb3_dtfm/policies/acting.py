@@ -10,14 +10,8 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_dtfm.actions import ActionSpace, from_vectors
-from sb3_dtfm.policies.critic import Critic
-from sb3_dtfm.policies.memory import RememberedContext
-from sb3_dtfm.policies.network import SequenceNetwork
-from sb3_dtfm.policies.normalization import Normalization
-from sb3_dtfm.policies.online_actor import OnlineActor, actor_observation, make_online_actor
-from sb3_dtfm.windows import (
+from sb3_dtfm.policies.context import (
     Context,
-    Windows,
     check_context,
     check_episode_start,
     empty_context,
@@ -26,6 +20,12 @@ from sb3_dtfm.windows import (
     unpack_observation,
     with_plan,
 )
+from sb3_dtfm.policies.critic import Critic
+from sb3_dtfm.policies.memory import RememberedContext
+from sb3_dtfm.policies.network import SequenceNetwork
+from sb3_dtfm.policies.normalization import Normalization
+from sb3_dtfm.policies.online_actor import OnlineActor, actor_observation, make_online_actor
+from sb3_dtfm.windows import Windows
 
 # How far apart in the noise table the candidates' rows lie, and those that chance chooses by: no divisors of its length.
 CANDIDATE_STRIDE, CHOICE_STRIDE, CHOICE_START = 97, 31, 513
@@ -339,9 +339,7 @@ class ActingPolicy(BasePolicy):
         windows = Windows(*(th.from_numpy(each if caches else each[due]).to(device) for each in context.windows))
         if not caches:
             return self.hidden_states(self.acting_network, windows, last_only=True).squeeze(1), keys_values
-        hidden, keys_values = self.acting_network.extend(
-            self.acting_network.within_range(self.normalization(windows)), context.keys_values
-        )
+        hidden, keys_values = self.acting_network.extend(self.normalization(windows), context.keys_values)
         return (hidden[th.from_numpy(due).to(device)] if due.any() else None), keys_values
 
     def _decode(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:

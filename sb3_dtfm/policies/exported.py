@@ -8,6 +8,7 @@ from gymnasium import spaces
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_dtfm.networks.cache import extend
 from sb3_dtfm.policies.network import SequenceNetwork
 from sb3_dtfm.policies.normalization import Normalization
 from sb3_dtfm.policies.online_actor import actor_observation
@@ -90,7 +91,7 @@ class ExportedPolicy(nn.Module):
             hidden = trunk(**windows, last_only=True).squeeze(1)
         else:
             n_new = trunk.tokens_per_step
-            hidden, filled = trunk.extend(**windows, keys_values=F.pad(keys_values, (0, 0, 0, n_new)))
+            hidden, filled = extend(trunk, **windows, keys_values=F.pad(keys_values, (0, 0, 0, n_new)))
             kept = (th.stack(filled, dim=1)[..., n_new:, :],)
         if noise is None or episode_keys is None:
             noise = hidden[:, :0]

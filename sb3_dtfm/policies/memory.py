@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 
-from sb3_dtfm.windows import Context
+from sb3_dtfm.policies.context import Context
 
 ADVICE = (
     "A context belongs to whoever passes `state`: pass the one that the last call for the same environment returned. "

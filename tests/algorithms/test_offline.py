@@ -361,7 +361,7 @@ def loss_curve(buffer, n_steps=500, trunk=(), **kwargs):
 def test_fast_paths_learn_as_plain_float32_does(cheetah_buffer, monkeypatch):
     """Same batches, other dropout masks: the loss curves differ no more than two streams of plain dropout do (2.4 %)."""
     fast = [loss_curve(cheetah_buffer, precision=precision) for precision in ("float32", "bfloat16")]
-    monkeypatch.setattr("sb3_dtfm.networks.cpu._draws_masks_here", lambda x: False)
+    monkeypatch.setattr("sb3_dtfm.networks.layers._draws_masks_here", lambda x: False)
     monkeypatch.setattr("sb3_dtfm.networks.trunk.attention", plain_attention)
     plain = loss_curve(cheetah_buffer, precision="float32")
     assert plain[-1] < 0.5 * plain[0]

@@ -15,8 +15,9 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from sb3_dtfm import DTFM
 from sb3_dtfm.files import ModelFileError
 from sb3_dtfm.finetuning import FinetunedDTFM, NoiseActionVecEnv
+from sb3_dtfm.policies.context import Context
 from sb3_dtfm.policies.exported import ExportedPolicy
-from sb3_dtfm.windows import Context, Windows
+from sb3_dtfm.windows import Windows
 from tests.algorithms.small import make_model
 from tests.finetuning.test_noise_env import CHUNKS, make_venv, table_noise
 

@@ -13,7 +13,7 @@ from sb3_dtfm import DTFM
 from sb3_dtfm.data import DatasetError, Trajectory, TrajectoryBuffer
 from sb3_dtfm.envs import OBSERVATION, ReturnToGoWrapper
 from sb3_dtfm.finetuning import OnlineDTFM
-from sb3_dtfm.windows import Context
+from sb3_dtfm.policies.context import Context
 from tests.algorithms.small import make_model, record_curves
 from tests.finetuning.test_learning import Sides, small_flow_of_two_sides
 from tests.finetuning.test_noise_env import CHUNKS, make_venv

@@ -2,7 +2,7 @@
 
 import torch as th
 
-from sb3_dtfm.networks.film import VectorField, sinusoidal_embedding
+from sb3_dtfm.networks.layers import VectorField, sinusoidal_embedding
 
 
 def test_sinusoidal_embedding_tells_neighbouring_times_apart():

@@ -3,6 +3,7 @@
 import pytest
 import torch as th
 
+from sb3_dtfm.networks.cache import extend
 from sb3_dtfm.networks.trunk import SequenceTrunk, TransformerBlock, causal_mask
 
 B, K, OBSERVATION_DIM, A = 3, 6, 5, 2
@@ -65,7 +66,7 @@ def test_a_step_is_one_token_of_its_return_to_go_its_observation_and_the_action_
     trunk = make_trunk(1, timestep_embedding=True)
     th.nn.init.normal_(trunk.embed_action.bias)
     window["mask"] = th.arange(K).repeat(B, 1) >= th.tensor([[0], [2], [K - 1]])
-    tokens = trunk._tokens(**window)
+    tokens = trunk.embed(**window)
     assert tokens.shape == (B, K, 16)
     for row, step in window["mask"].nonzero().tolist():
         expected = trunk.embed_return_to_go(window["returns_to_go"][row, step].reshape(1))
@@ -77,7 +78,7 @@ def test_a_step_is_one_token_of_its_return_to_go_its_observation_and_the_action_
 
 def test_a_window_has_as_many_tokens_as_it_says(trunk, window):
     assert [trunk.n_tokens(K), trunk.n_tokens(1)] == ([K, 1] if trunk.tokens_per_step == 1 else [3 * K - 1, 2])
-    assert trunk._tokens(**window).shape[1] == trunk.n_tokens(K)
+    assert trunk.embed(**window).shape[1] == trunk.n_tokens(K)
 
 
 def test_padding_on_the_left_changes_no_hidden_state(trunk, window):
@@ -154,7 +155,7 @@ def keep_extending(trunk, window, n_steps):
             for key, value in seen.items()
         }
         keys_values = th.nn.functional.pad(kept, (0, 0, 0, n_new))
-        hidden, _ = trunk.extend(**padded, keys_values=keys_values)
+        hidden, _ = extend(trunk, **padded, keys_values=keys_values)
         kept = keys_values[:, :, :, n_new:]
         hidden_states.append(hidden)
     return th.stack(hidden_states, dim=1)
@@ -191,7 +192,7 @@ def test_a_single_token_attends_to_itself():
     tokens, bias = th.randn(4, 1, 8), th.zeros(4, 2, 1, 1)
     short = block(tokens, None)
     query, key, value = block.attention_in(block.attention_norm(tokens)).split(8, dim=-1)
-    full = block._finish(tokens, block._attend(query, key, value, bias))
+    full = block.finish(tokens, block.attend(query, key, value, bias))
     assert th.allclose(short, full, atol=1e-6)
     grads = [th.autograd.grad(each.square().sum(), list(block.parameters())) for each in (short, full)]
     for mine, theirs in zip(*grads, strict=True):

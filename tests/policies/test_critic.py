@@ -9,8 +9,8 @@ from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.files import ModelFileError
 from sb3_dtfm.policies.acting import CANDIDATE_STRIDE
+from sb3_dtfm.policies.context import Context
 from sb3_dtfm.policies.critic import Critic
-from sb3_dtfm.windows import Context
 from tests.algorithms.small import make_model, record_curves
 
 SPACE = spaces.Box(-1.0, 1.0, (1,), np.float32)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sb3_dtfm import DTFM
-from sb3_dtfm.windows import empty_context, push
+from sb3_dtfm.policies.context import empty_context, push
 from tests.conftest import TINY_FLOW_POLICY, make_env
 
 N = 200

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sb3_dtfm import DT, DTFM
-from sb3_dtfm.windows import Context
+from sb3_dtfm.policies.context import Context
 from tests.algorithms.small import make_model
 
 N_ROWS, SICK = 3, 1

@@ -5,7 +5,7 @@ import pytest
 import torch as th
 from torch.nn import functional as F
 
-from sb3_dtfm.networks.cpu import FEW_ROWS, LARGE_WEIGHT, Linear, dropout, dropout_add, keep_mask
+from sb3_dtfm.networks.layers import FEW_ROWS, LARGE_WEIGHT, Linear, dropout, dropout_add, keep_mask
 from sb3_dtfm.networks.trunk import attention
 
 WIDE = -(-LARGE_WEIGHT // 5)  # outputs that make five inputs a large weight

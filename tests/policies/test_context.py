@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sb3_dtfm.windows import empty_context, push, with_action
+from sb3_dtfm.policies.context import empty_context, push, with_action
 
 
 def step(value: float, timestep: int, n_rows: int = 1):
