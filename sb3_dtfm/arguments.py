@@ -1,12 +1,13 @@
 """Arguments that a user gives, checked by name: one way to say what is accepted, one message for what is not."""
 
+import dataclasses
 import difflib
 import inspect
 import math
 import numbers
 import re
 from collections.abc import Collection, Iterable, Mapping
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -86,6 +87,46 @@ def check_arguments(given: Mapping[str, Any], accepted: Mapping[str, Rule]) -> d
         if not rule.accepts(values[name]):
             raise ValueError(f"{name} must be {rule}, got {given[name]!r}.")
     return values
+
+
+def option(default: Any, rule: Rule, acting: bool = False) -> Any:
+    """
+    A field of :class:`Options`.
+
+    :param default: its value where none is given
+    :param rule: the accepted values
+    :param acting: it may change after training
+    """
+    return dataclasses.field(default=default, metadata={"rule": rule, "acting": acting})
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """
+    Arguments as one value, checked when it is made; subclasses make their fields by :func:`option`.
+
+    :raises ValueError: names the argument, what was given and what is accepted
+    """
+
+    def __post_init__(self) -> None:
+        rules = {each.name: each.metadata["rule"] for each in dataclasses.fields(self)}
+        vars(self).update(check_arguments(vars(self), rules))
+
+    @classmethod
+    def defaults(cls) -> dict[str, Any]:
+        """All names with their defaults."""
+        return {each.name: each.default for each in dataclasses.fields(cls)}
+
+    def acting(self) -> dict[str, Any]:
+        """The values that may change after training."""
+        return {each.name: getattr(self, each.name) for each in dataclasses.fields(self) if each.metadata["acting"]}
+
+    def changed(self: "SelfOptions", **values: Any) -> "SelfOptions":
+        """A copy with other values, checked."""
+        return dataclasses.replace(self, **values)
+
+
+SelfOptions = TypeVar("SelfOptions", bound=Options)
 
 
 def with_nearest(names: Iterable[str], known: Iterable[str]) -> str:

@@ -246,9 +246,8 @@ def draw_flow(policy: Any, window: Any, seed: int = 0) -> "Figure":
     if not hasattr(head, "paths") or head.noise_dim != 2:
         found = f"the head is a {type(head).__name__} that starts from {head.noise_dim} numbers of noise"
         raise ValueError(f"Only a flow of two numbers can be drawn; {found}.")
-    policy.set_training_mode(False)
     with th.no_grad():
-        hidden = policy.hidden_states(policy.acting_network, policy.scaled_windows(window), last_only=True)[0]
+        hidden = policy.newest_hidden(window)
         noise = th.randn(N_PATHS, 2, generator=th.Generator().manual_seed(seed)).to(hidden.device)
         paths = head.paths(hidden.expand(N_PATHS, -1), noise).cpu()
     figure = Figure(figsize=(4.4, 4.4), layout="constrained")

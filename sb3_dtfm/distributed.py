@@ -118,7 +118,7 @@ class DataParallel:
         loss, parts = self._policy_loss(share, *(tensor[self._rows] for tensor in noise))
         weight = self._weight(batch.mask)
         loss, weighted = weight * loss, {name: weight * part for name, part in parts.items()}
-        for name, mask in self.policy.part_masks(batch.mask).items():
+        for name, mask in self.policy.network.head.part_masks(batch.mask).items():
             weighted[name] = self._weight(mask) * parts[name]
             loss = loss + weighted[name] - weight * parts[name]
         return loss, weighted

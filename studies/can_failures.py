@@ -72,7 +72,7 @@ def share_that_lets_go(policy: SequencePolicy, observation: dict[str, np.ndarray
     rows = np.zeros(N_DRAWS, int)
     repeated = {key: value[None][rows] for key, value in observation.items()}
     context, hidden = policy.encode(repeated, tuple(each[None][rows] for each in state), np.zeros(N_DRAWS, bool))
-    noise = np.random.default_rng(0).standard_normal((N_DRAWS, policy.check_noise_actions()))
+    noise = np.random.default_rng(0).standard_normal((N_DRAWS, policy.network.head.noise_dim))
     actions, _ = policy.decode(context, hidden, noise)
     return float((actions[:, :, GRIPPER] < 0).any(axis=1).mean())
 
@@ -108,7 +108,7 @@ def play(path: Path) -> tuple[Counter[str], list[float]]:
             if kind == ON_THE_WAY and model.policy.network.head.noise_dim:
                 opened = first_opened(*episode)
                 assert opened is not None
-                decision = opened - opened % model.policy.n_action_steps
+                decision = opened - opened % model.policy.options.n_action_steps
                 shares.append(share_that_lets_go(model.policy, seen[decision], knew[decision]))
             left[row] -= 1
             steps[row] = []

@@ -60,7 +60,7 @@ def matrix_flops(width: int, n_layers: int, flow_hidden_dim: int, tokens_per_ste
     generator = th.Generator().manual_seed(0)
     batch = model.buffer.sample(BATCH_SIZE, CONTEXT_LENGTH, generator)
     with FlopCounterMode(display=False) as counter:
-        loss, _ = model.policy.compute_loss(batch, *model.policy.draw_noise(batch, generator))
+        loss, _ = model.compute_loss(batch, *model.policy.network.draw_noise(batch, generator))
         loss.backward()
     return counter.get_total_flops()
 

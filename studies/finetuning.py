@@ -50,7 +50,10 @@ def measure(run: Path, before: Path, like: Row, label: str, output: Path) -> Non
     :param output: folder for the files
     """
     (folder,) = (path.parent for path in run.glob("*/config.yml"))
-    if run.parent.name == FINETUNED and load_agent(FINETUNED, run / f"{folder.name}.zip", "cpu").policy.n_action_steps > 1:
+    if (
+        run.parent.name == FINETUNED
+        and load_agent(FINETUNED, run / f"{folder.name}.zip", "cpu").policy.options.n_action_steps > 1
+    ):
         raise SystemExit(f"{run}: its timesteps are decisions of several actions; rows have the environment's steps.")
     settings = {**like["settings"], **read_run(before / folder.name), **read_run(folder)}
     settings.pop("callback", None)

@@ -153,7 +153,7 @@ def measure_algorithm(algo: str, env_id: str, n_envs: int, vec_env: str, seconds
         model = make_model(env_id)
         keep_one_action(model.policy, wrapper_class is ResidualActionVecEnv)
         envs: FrozenPolicyVecEnv = wrapper_class(make_envs(env_id, n_envs, vec_env), model, **arguments)
-        row = {"what": what, "n_action_steps": model.policy.n_action_steps}
+        row = {"what": what, "n_action_steps": model.policy.options.n_action_steps}
         if what == "wrapped":
             yield {**row, **measure_wrapped(envs, seconds)}
         else:

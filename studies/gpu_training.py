@@ -70,7 +70,7 @@ def matrix_flops(model: DTFM) -> float:
     generator = th.Generator(model.device).manual_seed(0)
     batch = model.buffer.sample(model.batch_size, model.context_length, generator)
     with FlopCounterMode(display=False) as counter:
-        loss, _ = model.policy.compute_loss(batch, *model.policy.draw_noise(batch, generator))
+        loss, _ = model.compute_loss(batch, *model.policy.network.draw_noise(batch, generator))
         loss.backward()
     return counter.get_total_flops()
 

@@ -51,6 +51,7 @@ from sb3_dtfm.files import ModelFile, file_name, holds_pickles, read_model, writ
 from sb3_dtfm.optimization import LEARNING_RATE_SCHEDULES, PRECISIONS, RunningMeans
 from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.policies.exported import ExportedPolicy
+from sb3_dtfm.policies.options import PolicyOptions
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineAlgorithm")
 
@@ -137,13 +138,12 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         super().__init_subclass__(**kwargs)
         policy = vars(cls).get("policy_aliases", {}).get(POLICY_NAMES[0])
         if isinstance(policy, type) and issubclass(policy, SequencePolicy):
-            head_options = set(policy.head_class.options())
             parts = [
                 inspect.cleandoc(cls.__doc__ or ""),
                 documented_parameters(OfflineAlgorithm),
                 "`policy_kwargs` may hold:",
-                documented_parameters(SequencePolicy, policy.parameter_names() - head_options),
-                documented_parameters(policy.head_class, head_options),
+                documented_parameters(PolicyOptions),
+                documented_parameters(policy.head_class.options_class),
             ]
             cls.__doc__ = "\n\n".join(filter(None, parts))
 
@@ -232,7 +232,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
             if normalization.return_to_go_range is not None:
                 normalization.set_return_to_go_range(taken.return_to_go_range())
             if self.policy.critic is not None:
-                self.policy.critic.set_scale(buffer.largest_discounted_return(self.policy.gamma))
+                self.policy.critic.set_scale(buffer.largest_discounted_return(self.policy.options.gamma))
 
     def _decide(self, buffer: TrajectoryBuffer) -> None:
         """Have the data decide of the policy's arguments what the user has left open; they are saved with the others."""

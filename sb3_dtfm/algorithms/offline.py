@@ -167,7 +167,7 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
             batch_size,
             self.context_length,
             th.Generator(self.device),
-            n_ahead=self.policy.chunk_size - 1,
+            n_ahead=self.policy.options.chunk_size - 1,
             return_weighting=self.return_weighting,
             seeds=seeds,
         )
@@ -190,13 +190,21 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
     def _loss_function(self) -> LossFunction:
         """The policy's loss in the precision asked for, compiled where that pays."""
         on_gpu = self.device.type == "cuda"
-        compute_loss = self.policy.compute_loss
+        compute_loss = self.compute_loss
         if self.compile or (self.compile is None and on_gpu):
             # "reduce-overhead" starts a GPU's kernels as one graph; one by one a step takes three times as long. With
             # several processes it is not measured.
             as_graph = on_gpu and n_processes() == 1
             compute_loss = th.compile(compute_loss, mode="reduce-overhead" if as_graph else "default")
         return autocast(self._chosen_precision(), self.device)(compute_loss)
+
+    def compute_loss(self, batch: Windows, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        """
+        :param batch: windows of a buffer, actions in the environment's range, (B, K + H - 1, A) of them
+        :param noise: what the network's `draw_noise` gave for the batch
+        :return: the loss to minimise, and its parts by their logged names
+        """
+        return self.policy.network.loss(self.policy.normalization.scale_batch(batch), *noise)
 
     def _chosen_precision(self) -> str:
         """ "float32" or "bfloat16": what was asked for, or what "auto" is here."""
@@ -222,7 +230,7 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         optimizer = self.policy.optimizer
         self._update_learning_rate(optimizer)
         optimizer.zero_grad(set_to_none=True)  # before the loss, which has the most in memory
-        loss, parts = parallel.compute_loss(batch, *self.policy.draw_noise(batch, generator))
+        loss, parts = parallel.compute_loss(batch, *self.policy.network.draw_noise(batch, generator))
         loss.backward()
         grad_norm = optimizer.clip_gradient(self.max_grad_norm or math.inf)
         means = parallel.mean({"loss": loss, "grad_norm": grad_norm, **parts, **self._learn_values()})
@@ -239,7 +247,7 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
 
     def _learn_values(self) -> dict[str, th.Tensor]:
         """The critic's gradient steps, the same on every process; means of what is logged."""
-        critic, n_steps = self.policy.critic, self.policy.critic_steps
+        critic, n_steps = self.policy.critic, self.policy.options.critic_steps
         if critic is None:
             return {}
         assert self._training_seed is not None
@@ -254,7 +262,7 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
     def _sample_transitions(self, batch_size: int, generator: th.Generator) -> Transitions:
         """What the critic learns from."""
         assert self.buffer is not None
-        return self.buffer.sample_transitions(batch_size, self.policy.critic_horizon, self.policy.gamma, generator)
+        return self.buffer.sample_transitions(batch_size, self.policy.critic_horizon, self.policy.options.gamma, generator)
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         factor = learning_rate_factor(self.learning_rate_schedule, *self._schedule_position(), self.warmup_steps)
@@ -329,18 +337,18 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
             # On a CPU torch has no class for it.
             if isinstance(error, RuntimeError) and not re.search("out of memory|(allocate|enough) memory", str(error), re.I):
                 raise
-            policy = self.policy
+            sizes = self.policy.options
             raise MemoryError(
                 f"A gradient step does not fit into the memory of {self.device}: batch_size={self.batch_size}, "
-                f"context_length={self.context_length}, chunk_size={policy.chunk_size}, embed_dim="
-                f"{policy.network.trunk.embed_dim}, n_layers={policy.network.trunk.n_layers}. Lower batch_size first."
+                f"context_length={self.context_length}, chunk_size={sizes.chunk_size}, embed_dim={sizes.embed_dim}, "
+                f"n_layers={sizes.n_layers}. Lower batch_size first."
             ) from error
 
     def _log(self, means: dict[str, float]) -> None:
         for name, mean in means.items():
             self.logger.record(f"train/{name}", mean)
         self.logger.record("train/action_mse", self._on_training_windows(self.policy.action_mse))
-        if self.policy.n_action_samples > 1:
+        if self.policy.options.n_action_samples > 1:
             self.logger.record("train/best_of_n_share", self._on_training_windows(self.policy.best_of_n_share))
         self.logger.record("train/learning_rate", self._current_learning_rate)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")

@@ -6,7 +6,7 @@ import numpy as np
 import torch as th
 
 # Standard deviations at which normalised observations are clipped; a dimension with a smaller one than this is constant.
-CLIP, SMALLEST_STD = 10.0, 1e-6
+CLIP, SMALLEST_STD = 10.0, 1e-5
 # Rows are summed in blocks of about this many bytes, which stay in the processor's cache.
 BLOCK_BYTES = 2**18
 # A variance below this share of the mean square is computed again, without the mean.
@@ -36,7 +36,7 @@ class Statistics(NamedTuple):
         :return: in standard deviations from the mean, clipped at 10; a dimension that is constant becomes zero
         """
         mean, std = (th.as_tensor(each, dtype=th.float32) for each in (self.observation_mean, self.observation_std))
-        return ((observations - mean) / th.where(std > SMALLEST_STD, std, 1.0)).clamp(-CLIP, CLIP)
+        return ((observations - mean) / th.where(std > SMALLEST_STD, std, th.inf)).clamp(-CLIP, CLIP)
 
 
 class EpisodeTable(NamedTuple):

@@ -1,24 +1,65 @@
 """A DTFM and the noise policy or residual policy that was learned for it, as one model."""
 
 import io
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
 from sb3_dtfm.algorithms import DTFM
+from sb3_dtfm.algorithms.base import POLICY_NAMES
 from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
+from sb3_dtfm.finetuning.online_actor import (
+    ACTIVATIONS,
+    OnlineActor,
+    check_noise_actions,
+    check_residual_actions,
+    make_online_actor,
+)
 from sb3_dtfm.finetuning.residual_env import ResidualActionVecEnv
-from sb3_dtfm.policies import SequencePolicy
-from sb3_dtfm.policies.online_actor import ACTIVATIONS
+from sb3_dtfm.policies import DTFMPolicy, SequencePolicy
 
 # What commands and folders of runs call it.
 FINETUNED = "finetuned"
 # Classes whose actors can be taken over, by whether they squash their actions by tanh; sb3-contrib is an extra.
 SQUASHED = {"SAC": True, "TQC": True, "PPO": False, "A2C": False, "TRPO": False}
+
+
+class FinetunedPolicy(DTFMPolicy):
+    """DTFM's policy with a network that chooses its noise, or adds a residual action."""
+
+    def set_online_actor(self, settings: dict[str, Any] | None) -> None:
+        """
+        Let an online actor choose from now on; its weights are for the caller to load.
+
+        :param settings: of :class:`~sb3_dtfm.finetuning.online_actor.OnlineActor`; None draws noise again
+        :raises ValueError: the head starts from no noise, or a setting out of range
+        """
+        if settings is None:
+            self.online_actor = None
+            return
+        sizes = (self.observation_dim, self.options.embed_dim, check_noise_actions(self), self.action_dim)
+        self.online_actor = make_online_actor(*sizes, settings).to(self.device).requires_grad_(False)
+
+    def set_acting(self, **settings: Any) -> None:
+        if isinstance(self.online_actor, OnlineActor) and self.online_actor.residual and "n_action_steps" in settings:
+            check_residual_actions(self, self.options.changed(n_action_steps=settings["n_action_steps"]).n_action_steps)
+        super().set_acting(**settings)
+
+    def save(self, path: str) -> None:
+        """
+        SB3's: the policy alone.
+
+        :param path: file to write
+        :raises ValueError: it is fine-tuned, which only the model's own file can hold
+        """
+        if self.online_actor is not None:
+            raise ValueError("A fine-tuned policy is saved with its model: model.save(path).")
+        super().save(path)
 
 
 class FinetunedDTFM(DTFM):
@@ -35,12 +76,16 @@ class FinetunedDTFM(DTFM):
     `SAC("MlpPolicy", NoiseActionVecEnv(venv, model))` or `PPO("MlpPolicy", ResidualActionVecEnv(venv, model))`.
     """
 
+    policy: FinetunedPolicy
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = dict.fromkeys(POLICY_NAMES, FinetunedPolicy)
+
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.online_actor: dict[str, Any] | None = None
         super().__init__(*args, **kwargs)
 
     def _make_policy(self, ema: bool) -> SequencePolicy:
         policy = super()._make_policy(ema)
+        assert isinstance(policy, FinetunedPolicy)
         policy.set_online_actor(self.online_actor)
         return policy
 
@@ -71,7 +116,7 @@ class FinetunedDTFM(DTFM):
         """
         settings, weights = _take_over(agent)
         if settings["residual"]:
-            self.policy.check_residual_actions(self.policy.n_action_steps)
+            check_residual_actions(self.policy, self.policy.options.n_action_steps)
         if settings != self.online_actor or self.policy.online_actor is None:
             self.policy.set_online_actor(settings)
             self.online_actor = settings
@@ -87,7 +132,7 @@ class FinetunedDTFM(DTFM):
 
 def _take_over(agent: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
     """
-    An actor as settings and weights of :class:`~sb3_dtfm.policies.online_actor.OnlineActor`.
+    An actor as settings and weights of :class:`~sb3_dtfm.finetuning.online_actor.OnlineActor`.
 
     :raises ValueError: one that has another form
     """

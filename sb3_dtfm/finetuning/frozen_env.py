@@ -12,9 +12,11 @@ from sb3_dtfm.algorithms import DTFM
 from sb3_dtfm.algorithms.offline import OfflineSequenceAlgorithm
 from sb3_dtfm.arguments import POSITIVE, check_arguments
 from sb3_dtfm.envs import BETWEEN, OBSERVATION, RETURN_TO_GO, TIMESTEP, check_vec_env, share_target_return
+from sb3_dtfm.finetuning.online_actor import actor_observation
 from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.policies.context import Context
 from sb3_dtfm.policies.normalization import OBSERVATION_CLIP
+from sb3_dtfm.windows import Windows
 
 
 class FrozenPolicyVecEnv(VecEnvWrapper):
@@ -51,7 +53,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
         check_vec_env(venv)
         model._check_spaces(venv.observation_space, venv.action_space, "The environment has", "the model's are")  # type: ignore[arg-type]
         share_target_return(venv, model.target_return)
-        n_shown = self._n_shown(model.policy) + (model.policy.network.trunk.embed_dim if hidden_state else 0)
+        n_shown = self._n_shown(model.policy) + (model.policy.options.embed_dim if hidden_state else 0)
         super().__init__(venv, spaces.Box(-OBSERVATION_CLIP, OBSERVATION_CLIP, (n_shown,), np.float32), action_space)
         self.model = model
         self.bound = float(bound)
@@ -86,7 +88,8 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
     def _show(self, context: Context, hidden: th.Tensor) -> np.ndarray:
         """:return: (B, F), what is observed of rows that have not acted"""
         with th.inference_mode():
-            shown = self.policy.actor_observation(context.windows, hidden if self.hidden_state else None)
+            newest = Windows(*(th.from_numpy(each[:, -1:]).to(hidden.device) for each in context.windows))
+            shown = actor_observation(self.policy.normalization, newest, hidden if self.hidden_state else None)
         return shown.cpu().numpy()
 
     @property
@@ -105,7 +108,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
         """
         assert self._known is not None, "reset() comes before step()"
         chosen, self._acted = self._act(*self._known, actions)
-        self.venv.step_async(chosen if self.policy.n_action_steps > 1 else chosen[:, 0])
+        self.venv.step_async(chosen if self.policy.options.n_action_steps > 1 else chosen[:, 0])
 
     def step_wait(self) -> VecEnvStepReturn:
         observations, rewards, dones, infos = self.venv.step_wait()
@@ -117,7 +120,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
             context = self._pass(Context(*(each[[row]] for each in self._acted)), [between[row]], n_between[row])
             last = {key: value[None] for key, value in infos[row]["terminal_observation"].items()}
             infos[row]["terminal_observation"] = self._show(*self.policy.encode(last, context))[0]
-        context = self._pass(self._acted, between, self.policy.n_action_steps - 1)
+        context = self._pass(self._acted, between, self.policy.options.n_action_steps - 1)
         self._known = self.policy.encode(observations, context, dones)  # type: ignore[arg-type]
         return self._show(*self._known), rewards, dones, infos
 

@@ -9,6 +9,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dtfm.algorithms.offline import OfflineSequenceAlgorithm
 from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
+from sb3_dtfm.finetuning.online_actor import check_noise_actions
 from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.policies.context import Context
 
@@ -65,7 +66,7 @@ class NoiseActionVecEnv(FrozenPolicyVecEnv):
 
     @staticmethod
     def _action_space(policy: SequencePolicy, bound: float) -> spaces.Box:
-        noise_dim = policy.check_noise_actions()
+        noise_dim = check_noise_actions(policy)
         if not policy.network.head.noise_decides:
             raise ValueError(
                 "flow_steps=1: one step of Euler ends at the mean action, from any noise; "

@@ -278,7 +278,7 @@ class OnlineDTFM(DTFM):
         if self.replay_buffer is None:
             return super()._sample_transitions(batch_size, generator)
         n_own = self._n_own(self.replay_buffer, batch_size)
-        own = self.replay_buffer.sample_transitions(n_own, self.policy.critic_horizon, self.policy.gamma, generator)
+        own = self.replay_buffer.sample_transitions(n_own, self.policy.critic_horizon, self.policy.options.gamma, generator)
         if n_own == batch_size:
             return own
         others = super()._sample_transitions(batch_size - n_own, generator)

@@ -10,6 +10,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 
 from sb3_dtfm.algorithms.offline import OfflineSequenceAlgorithm
 from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
+from sb3_dtfm.finetuning.online_actor import check_residual_actions
 from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.policies.context import Context
 
@@ -47,10 +48,10 @@ class ResidualActionVecEnv(FrozenPolicyVecEnv):
 
     @staticmethod
     def _action_space(policy: SequencePolicy, bound: float) -> spaces.Box:
-        policy.check_residual_actions(policy.n_action_steps)
-        if policy.n_action_samples > 1:
+        check_residual_actions(policy, policy.options.n_action_steps)
+        if policy.options.n_action_samples > 1:
             raise ValueError(
-                f"n_action_samples={policy.n_action_samples}: residual actions are added to one sample; "
+                f"n_action_samples={policy.options.n_action_samples}: residual actions are added to one sample; "
                 "model.policy.set_acting(n_action_samples=1) leaves the critic out."
             )
         return spaces.Box(-bound, bound, (policy.action_dim,), np.float32)

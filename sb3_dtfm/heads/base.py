@@ -1,11 +1,12 @@
 """What the policy, the algorithm, RL-Zoo and the benchmark ask of a head."""
 
-import inspect
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
 import torch as th
 from torch import nn
+
+from sb3_dtfm.arguments import Options
 
 # Rows of the table that deterministic acting takes its noise from.
 NOISE_ROWS = 1024
@@ -15,43 +16,32 @@ class ActionHead(nn.Module, ABC):
     """
     From hidden states to actions in [-1, 1].
 
-    A head's options are the keyword-only arguments of its constructor: users give them among `policy_kwargs`.
-
     :param embed_dim: width D of the hidden states
     :param action_dim: A
+    :param options: of `options_class`, by name: users give them among `policy_kwargs`
+    :raises ValueError: an option out of range, by name
 
     :cvar algorithm: name of the algorithm that trunk and head make together, for example "DTFM"
-    :cvar discrete: the head that takes its place, and its options, where the action space is Discrete; None refuses it
-    :cvar acting_choices: options that may be changed after training, attributes of the head; `check_acting` checks them
+    :cvar discrete: the head for Discrete action spaces, with this head's options; None refuses them
+    :cvar options_class: the head's options
+    :ivar options: how the head was made and acts; :meth:`Options.changed` gives other ways of acting
     :ivar noise_dim: numbers of standard normal noise that an action starts from, 0 if none
     """
 
     algorithm: ClassVar[str]
     discrete: ClassVar[type["ActionHead"] | None] = None
-    acting_choices: ClassVar[tuple[str, ...]] = ()
+    options_class: ClassVar[type[Options]] = Options
+    options: Any
     noise_dim: int = 0
 
-    def __init__(self, embed_dim: int, action_dim: int) -> None:
+    def __init__(self, embed_dim: int, action_dim: int, **options: Any) -> None:
         super().__init__()
-
-    @classmethod
-    def options(cls) -> dict[str, Any]:
-        """The head's options with their defaults."""
-        parameters = inspect.signature(cls).parameters.values()
-        return {each.name: each.default for each in parameters if each.kind is inspect.Parameter.KEYWORD_ONLY}
+        self.options = self.options_class(**options)
 
     @property
     def noise_decides(self) -> bool:
         """Whether other noise leads to other actions, as the head acts now."""
         return self.noise_dim > 0
-
-    def check_acting(self, **choices: Any) -> dict[str, Any]:
-        """
-        :param choices: all of `acting_choices`
-        :return: the same, as attributes of the head
-        :raises ValueError: names the choice, what was given and what is accepted
-        """
-        return choices
 
     def deterministic_noise(self, generator: th.Generator) -> th.Tensor:
         """

@@ -4,12 +4,13 @@ The flow-matching head on one page: path, loss, distillation, solver.
 Time runs one way everywhere: tau = 0 is noise, tau = 1 is the action.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch as th
 from torch import nn
 
-from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, POSITIVE, Choice, Number, Rule, check_arguments
+from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, POSITIVE, Choice, Number, Options, option
 from sb3_dtfm.heads.base import ActionHead, masked_mean
 from sb3_dtfm.heads.regression import RegressionHead
 from sb3_dtfm.networks.layers import FilmNetwork, VectorField
@@ -22,15 +23,41 @@ MAX_DISTILLED_STEPS = 16
 # Values of tau in a window, which its steps take in turn: the share of tau in scales and shifts is computed once for each.
 TAUS_PER_WINDOW = 4
 
-OPTIONS: dict[str, Rule] = {
-    "flow_hidden_dim": COUNT,
-    "flow_n_layers": COUNT,
-    "flow_prediction": Choice(("velocity", "action")),
-    "flow_tau_exponent": POSITIVE,
-    "regression_coef": NOT_NEGATIVE,
-    "one_step_policy": BOOLEAN,
-}
-ACTING: dict[str, Rule] = {"flow_solver": Choice((*SOLVERS, ONE_STEP)), "flow_steps": Number(low=0, high=10_000, whole=True)}
+
+@dataclass(frozen=True)
+class FlowOptions(Options):
+    """
+    Options of :class:`FlowHead`.
+
+    :param flow_steps: steps of the ODE solver; 0 takes the mean action, which no noise changes
+    :param flow_solver: an ODE solver, euler, midpoint, heun or rk4; or one_step, the distilled network
+    :param flow_hidden_dim: width of the vector field's hidden layers
+    :param flow_n_layers: number of its hidden layers
+    :param flow_prediction: what the head learns of the path: its "velocity", or the "action" it leads to
+    :param flow_tau_exponent: tau of the loss is u to this power for u uniform in [0, 1]: above 1 it is more often near the
+        noise, where the action has to come from the hidden state
+    :param regression_coef: weight of the regression of the action from the hidden state; 0 leaves it out
+    :param one_step_policy: train a network that takes one evaluation for all solver steps
+    :raises ValueError: an option out of range, or a way of acting that the others do not train, by name
+    """
+
+    flow_steps: int = option(10, Number(low=0, high=10_000, whole=True), acting=True)
+    flow_solver: str = option("euler", Choice((*SOLVERS, ONE_STEP)), acting=True)
+    flow_hidden_dim: int = option(128, COUNT)
+    flow_n_layers: int = option(3, COUNT)
+    flow_prediction: str = option("action", Choice(("velocity", "action")))
+    flow_tau_exponent: float = option(2.0, POSITIVE)
+    regression_coef: float = option(1.0, NOT_NEGATIVE)
+    one_step_policy: bool = option(False, BOOLEAN)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.flow_solver == ONE_STEP and not self.one_step_policy:
+            raise ValueError(
+                f"flow_solver={ONE_STEP!r} needs a model that was trained with policy_kwargs=dict(one_step_policy=True)."
+            )
+        if self.flow_steps == 0 and not self.regression_coef:
+            raise ValueError("flow_steps=0 needs a model that was trained with policy_kwargs=dict(regression_coef=1.0).")
 
 
 def interpolate(noise: th.Tensor, action: th.Tensor, tau: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -71,70 +98,34 @@ class FlowHead(ActionHead):
 
     :param embed_dim: D
     :param action_dim: A
-    :param flow_hidden_dim: width of the vector field's hidden layers
-    :param flow_n_layers: number of its hidden layers
-    :param flow_prediction: what the head learns of the path: its "velocity", or the "action" it leads to
-    :param flow_tau_exponent: tau of the loss is u to this power for u uniform in [0, 1]: above 1 it is more often near the
-        noise, where the action has to come from the hidden state
-    :param flow_solver: how to act: an ODE solver, euler, midpoint, heun or rk4; or one_step, the network that learnt its end
-    :param flow_steps: steps of the ODE solver; 0 takes the mean action, which no noise changes
-    :param one_step_policy: train that network
-    :param regression_coef: weight of the regression of the action from the hidden state; 0 leaves it out
-    :raises ValueError: an option out of range, by name
+    :param options: of :class:`FlowOptions`
     """
 
     algorithm = "DTFM"
-    acting_choices = ("flow_solver", "flow_steps")
+    options_class = FlowOptions
+    options: FlowOptions
 
-    def __init__(
-        self,
-        embed_dim: int,
-        action_dim: int,
-        *,
-        flow_hidden_dim: int = 128,
-        flow_n_layers: int = 3,
-        flow_prediction: str = "action",
-        flow_tau_exponent: float = 2.0,
-        flow_solver: str = "euler",
-        flow_steps: int = 10,
-        one_step_policy: bool = False,
-        regression_coef: float = 1.0,
-    ) -> None:
-        super().__init__(embed_dim, action_dim)
-        check_arguments(locals(), OPTIONS)
+    def __init__(self, embed_dim: int, action_dim: int, **options: Any) -> None:
+        super().__init__(embed_dim, action_dim, **options)
         self.noise_dim = action_dim
-        self.flow_tau_exponent = flow_tau_exponent
-        self.regression_coef = regression_coef
-        sizes = (action_dim, embed_dim, flow_hidden_dim, flow_n_layers)
+        sizes = (action_dim, embed_dim, self.options.flow_hidden_dim, self.options.flow_n_layers)
         self.vector_field = VectorField(*sizes)
-        self.predicts_action = flow_prediction == "action"
-        regresses = self.predicts_action or regression_coef > 0
+        self.predicts_action = self.options.flow_prediction == "action"
+        regresses = self.predicts_action or self.options.regression_coef > 0
         self.regression = RegressionHead(embed_dim, action_dim) if regresses else None
-        self.one_step_policy = FilmNetwork(*sizes) if one_step_policy else None
+        self.one_step_policy = FilmNetwork(*sizes) if self.options.one_step_policy else None
         if self.predicts_action:
             for network in (self.vector_field, self.one_step_policy):
                 if network is not None:
                     nn.init.zeros_(network.output.weight)
                     nn.init.zeros_(network.output.bias)
-        acting = self.check_acting(flow_solver=flow_solver, flow_steps=flow_steps)
-        self.flow_solver: str = acting["flow_solver"]
-        self.flow_steps: int = acting["flow_steps"]
-        self.n_distilled_steps = min(max(flow_steps, 1), MAX_DISTILLED_STEPS)  # however it acts later
-
-    def check_acting(self, **choices: Any) -> dict[str, Any]:
-        choices = check_arguments(choices, ACTING)
-        if choices["flow_solver"] == ONE_STEP and self.one_step_policy is None:
-            raise ValueError(
-                f"flow_solver={ONE_STEP!r} needs a model that was trained with policy_kwargs=dict(one_step_policy=True)."
-            )
-        if choices["flow_steps"] == 0 and not self.regression_coef:
-            raise ValueError("flow_steps=0 needs a model that was trained with policy_kwargs=dict(regression_coef=1.0).")
-        return choices
+        self.n_distilled_steps = min(max(self.options.flow_steps, 1), MAX_DISTILLED_STEPS)  # however it acts later
 
     @property
     def noise_decides(self) -> bool:
         """Not without a solver's step, nor by one of Euler, which ends at the mean action from wherever it begins."""
-        return self.flow_solver == ONE_STEP or self.flow_steps > (1 if self.flow_solver == "euler" else 0)
+        solver, n_steps = self.options.flow_solver, self.options.flow_steps
+        return solver == ONE_STEP or n_steps > (1 if solver == "euler" else 0)
 
     def draw_noise(self, actions: th.Tensor, generator: th.Generator) -> tuple[th.Tensor, ...]:
         batch_size, context_length = actions.shape[:2]
@@ -142,18 +133,18 @@ class FlowHead(ActionHead):
         start = th.rand((), generator=generator, device=actions.device)
         rows = th.linspace(0, 1, batch_size + 1, device=actions.device)[:-1, None]
         turns = th.linspace(0, 1, TAUS_PER_WINDOW + 1, device=actions.device)[:-1]
-        return noise, (start + rows + turns)[:, :context_length].remainder(1.0) ** self.flow_tau_exponent
+        return noise, (start + rows + turns)[:, :context_length].remainder(1.0) ** self.options.flow_tau_exponent
 
     def loss(
         self, hidden: th.Tensor, actions: th.Tensor, mask: th.Tensor, *noise: th.Tensor
     ) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         starts, tau = noise
-        loss = self.flow_loss(hidden.detach() if self.regression_coef else hidden, actions, mask, starts, tau)
+        loss = self.flow_loss(hidden.detach() if self.options.regression_coef else hidden, actions, mask, starts, tau)
         parts = {"flow_loss": loss}
-        if self.regression_coef:
+        if self.options.regression_coef:
             assert self.regression is not None
             regression_loss, regression_parts = self.regression.loss(hidden, actions, mask)
-            loss, parts = loss + self.regression_coef * regression_loss, {**parts, **regression_parts}
+            loss, parts = loss + self.options.regression_coef * regression_loss, {**parts, **regression_parts}
         if self.one_step_policy is not None:
             parts["one_step_loss"] = self.one_step_loss(hidden[:, -1], mask[:, -1], starts[:, -1])
             loss = loss + parts["one_step_loss"]
@@ -184,7 +175,7 @@ class FlowHead(ActionHead):
         """W h + b, (..., A); learned by the regression alone where there is one."""
         assert self.regression is not None
         regressed = self.regression.linear(hidden)
-        return regressed.detach() if self.regression_coef else regressed
+        return regressed.detach() if self.options.regression_coef else regressed
 
     def one_step_loss(self, hidden: th.Tensor, mask: th.Tensor, noise: th.Tensor) -> th.Tensor:
         """
@@ -201,12 +192,12 @@ class FlowHead(ActionHead):
         return masked_mean((self.one_step_action(hidden, noise) - target).square(), mask)
 
     def forward(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
-        if self.flow_solver == ONE_STEP:
+        if self.options.flow_solver == ONE_STEP:
             return self.one_step_action(hidden, noise)
-        if self.flow_steps == 0:
+        if self.options.flow_steps == 0:
             assert self.regression is not None
             return self.regression(hidden)
-        return self.solve(hidden, noise, self.flow_solver, self.flow_steps)
+        return self.solve(hidden, noise, self.options.flow_solver, self.options.flow_steps)
 
     def one_step_action(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
         """From noise (..., A) to actions (..., A) in one step. No gradient flows into the field's W h + b."""

@@ -14,7 +14,7 @@ class DTFMPolicy(SequencePolicy):
     """
     Decision Transformer with flow matching: the hidden state conditions a vector field from noise to action.
 
-    Arguments are those of `SequencePolicy` and, by name, the options of :class:`~sb3_dtfm.heads.flow.FlowHead`.
+    Arguments are those of `SequencePolicy` and, by name, :class:`~sb3_dtfm.heads.flow.FlowOptions`.
     """
 
     head_class = FlowHead

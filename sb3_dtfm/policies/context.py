@@ -182,6 +182,27 @@ def with_plan(context: Context, due: np.ndarray, chunk: np.ndarray) -> Context:
     return with_action(context, actions[:, 0])._replace(plan=actions[:, 1:], n_planned=n_planned)
 
 
+def check_chunks(context: Context, due: np.ndarray, chunks: np.ndarray) -> None:
+    """
+    Say why there is no finite action for some rows, although the numbers that `predict` lets in are finite.
+
+    :param due: (B,) bool, b rows that have new actions
+    :param chunks: (b, H, A), their actions
+    :raises ValueError: they are not finite
+    """
+    if (fits := np.isfinite(chunks)).all():
+        return
+    rows = np.flatnonzero(due)[~fits.all(axis=(1, 2))]
+    names = [name for name, array in context._asdict().items() if not np.isfinite(array[rows]).all()]
+    largest = np.abs(context.returns_to_go[rows]).max()
+    cause = (
+        f"state holds NaN or infinity in {', '.join(names)}. Begin these rows anew with episode_start."
+        if names
+        else f"the policy's weights give none for a return_to_go of {largest:g}. Ask for less, or load other weights."
+    )
+    raise ValueError(f"There is no finite action in row {', '.join(map(str, rows))}: {cause}")
+
+
 def _shift(window: np.ndarray, newest: np.ndarray | float) -> np.ndarray:
     shifted = np.empty(window.shape, window.dtype)
     shifted[:, :-1] = window[:, 1:]

@@ -5,7 +5,9 @@ Values are per unit of reward that :meth:`Critic.set_scale` chose; gradient step
 """
 
 import copy
+from collections.abc import Callable
 
+import numpy as np
 import torch as th
 from torch import nn
 
@@ -16,6 +18,8 @@ TARGET_SHARE = 0.005
 LEARNING_RATE = 3e-4
 # What the largest discounted return-to-go becomes.
 LARGEST_VALUE = 10.0
+# How far apart in the noise table the samples' rows lie, and those that chance chooses by: no divisors of its length.
+SAMPLE_STRIDE, CHOICE_STRIDE, CHOICE_START = 97, 31, 513
 # How fast the spread of advantages follows the batches.
 STD_SHARE = 0.01
 
@@ -41,6 +45,7 @@ class Critic(nn.Module):
     def __init__(self, observation_dim: int, action_dim: int, hidden_dim: int = 256, expectile: float = 0.7) -> None:
         super().__init__()
         self.expectile = expectile
+        self.action_dim = action_dim
         self.q = nn.ModuleList(_mlp(observation_dim + action_dim, hidden_dim) for _ in range(2))
         self.q_target = copy.deepcopy(self.q).requires_grad_(False)
         self.value = _mlp(observation_dim, hidden_dim)
@@ -120,6 +125,37 @@ class Critic(nn.Module):
         followers = [parameter.data for parameter in self.q_target.parameters()]
         th._foreach_lerp_(followers, [parameter.data for parameter in self.q.parameters()], TARGET_SHARE)
         return parts
+
+    def best_of_n(
+        self,
+        observations: th.Tensor,
+        rows: np.ndarray,
+        draw: Callable[[np.ndarray], th.Tensor],
+        decode: Callable[[th.Tensor], th.Tensor],
+        n_samples: int,
+        noise_std: float,
+        temperature: float,
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """
+        Several draws from the head, and which of them the critic takes.
+
+        :param observations: (b, O), normalised
+        :param rows: (b,) of the noise table; the first sample's are these, and what it would be without others
+        :param draw: from rows (M,) to noise (M, noise_dim)
+        :param decode: from noise (b, N, noise_dim) to actions (b, N, H A) in [-1, 1]
+        :param n_samples: N
+        :param noise_std: standard deviation of the noise of all samples but the first
+        :param temperature: see :meth:`choose`
+        :return: actions (b, N, H A), and the index (b,) int64 of the one that is taken
+        """
+        shape, turns = (len(rows), n_samples), np.arange(n_samples)
+        noise = draw((rows[:, None] + SAMPLE_STRIDE * turns).ravel()).to(observations.device).view(*shape, -1)
+        noise[:, 1:] *= noise_std
+        samples = decode(noise)
+        chance = draw((rows[:, None] + CHOICE_START + CHOICE_STRIDE * turns).ravel())[:, 0]
+        uniform = th.special.ndtr(chance).clamp(1e-6, 1 - 1e-6).view(shape).to(observations.device)
+        gains = self.gains(observations, samples[..., : self.action_dim])
+        return samples, self.choose(gains, temperature, uniform)
 
     def choose(self, gains: th.Tensor, temperature: float, uniform: th.Tensor) -> th.Tensor:
         """

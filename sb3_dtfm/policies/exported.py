@@ -11,8 +11,7 @@ from torch.nn import functional as F
 from sb3_dtfm.networks.cache import extend
 from sb3_dtfm.policies.network import SequenceNetwork
 from sb3_dtfm.policies.normalization import Normalization
-from sb3_dtfm.policies.online_actor import actor_observation
-from sb3_dtfm.policies.sequence import SequencePolicy
+from sb3_dtfm.policies.sequence import SequencePolicy, choose_actions
 from sb3_dtfm.windows import Windows
 
 
@@ -33,9 +32,9 @@ class ExportedPolicy(nn.Module):
 
     def __init__(self, policy: SequencePolicy) -> None:
         super().__init__()
-        if policy.n_action_samples > 1 and policy.online_actor is None:
+        if policy.takes_best_of_n:
             raise ValueError(
-                f"n_action_samples={policy.n_action_samples}: a choice by the critic is not exported; "
+                f"n_action_samples={policy.options.n_action_samples}: a choice by the critic is not exported; "
                 "`n_action_samples:1` among the ways of acting exports the flow alone."
             )
         self.normalization: Normalization = copy.deepcopy(policy.normalization).cpu()
@@ -43,10 +42,10 @@ class ExportedPolicy(nn.Module):
         self.online_actor = copy.deepcopy(policy.online_actor).cpu() if policy.online_actor is not None else None
         self.register_buffer("noise_table", policy.noise_table.cpu())
         self.context_length = policy.context_length
-        self.keeps = policy.kv_cache and policy.context_length > 1
+        self.keeps = policy.options.kv_cache and policy.context_length > 1
         self.settings: dict[str, Any] = {
             "context_length": policy.context_length,
-            "chunk_size": policy.chunk_size,
+            "chunk_size": policy.options.chunk_size,
             "observation_dim": policy.observation_dim,
             "action_dim": policy.action_dim,
             "action_low": policy.vector_space.low.tolist(),
@@ -82,9 +81,9 @@ class ExportedPolicy(nn.Module):
         :return: chunk (B, H, A), the actions for this step and the next ones, in the action space; with `kv_cache` the
             next `keys_values`
         """
-        trunk, head = self.network.trunk, self.network.head
-        scaled = self.normalization.scale_action(actions)
-        normalized = self.normalization(Windows(observations, scaled, returns_to_go, timesteps, mask))
+        trunk = self.network.trunk
+        given = Windows(observations, self.normalization.scale_action(actions), returns_to_go, timesteps, mask)
+        normalized = self.normalization(given)
         windows = self.network.within_range(normalized)._asdict()
         kept: tuple[th.Tensor, ...] = ()
         if keys_values is None:
@@ -99,15 +98,8 @@ class ExportedPolicy(nn.Module):
             rows = (timesteps[:, -1] + episode_keys) % len(self.noise_table)
             noise = th.where(noise.any(dim=1, keepdim=True), noise, self.noise_table[rows])
 
-        def decode(noise: th.Tensor) -> th.Tensor:
-            return head(hidden, noise).clamp(-1.0, 1.0)
-
-        if self.online_actor is None:
-            chunk = decode(noise)
-        else:
-            newest = Windows(*(each[:, -1:] for each in (observations, scaled, returns_to_go, timesteps, mask)))
-            shown = actor_observation(self.normalization, newest, hidden if self.online_actor.hidden_state else None)
-            chunk = self.online_actor.act(shown, noise, decode)
+        newest = Windows(*(each[:, -1:] for each in given))
+        chunk = choose_actions(self.network, self.normalization, self.online_actor, newest, hidden, noise)
         chunk = chunk.unflatten(1, (-1, self.settings["action_dim"]))
         return self.normalization.unscale_action(chunk), *kept
 

@@ -40,12 +40,17 @@ class RememberedContext:
             return after
         return before if again.all() else _choose(again, before, after)
 
-    def remember(self, before: Context, after: Context) -> None:
+    def remember(self, before: Context, after: Context) -> Context:
         """
         :param before: what :meth:`recall` gave, or an empty context
         :param after: with the newest step and its action
+        :return: it for the caller, who cannot write into what is remembered
         """
         self._before, self._after = before, after
+        shown = Context(*(array.view() for array in after))
+        for array in shown:
+            array.flags.writeable = False
+        return shown
 
     def warn(self, what: str) -> None:
         """Tell once how contexts are kept apart."""

@@ -1,4 +1,4 @@
-"""Trunk and head as one network, and its newest hidden states from what was kept of earlier steps."""
+"""Everything that is trained: trunk, head, and the expected range of returns-to-go."""
 
 import numpy as np
 import torch as th
@@ -6,16 +6,58 @@ from torch import nn
 
 from sb3_dtfm.heads import ActionHead
 from sb3_dtfm.networks.cache import extend_cache
-from sb3_dtfm.networks.return_range import ReturnRange
+from sb3_dtfm.networks.layers import Linear
 from sb3_dtfm.networks.trunk import SequenceTrunk
 from sb3_dtfm.windows import Windows
+
+HIDDEN_DIM = 256
+# The lower and the upper expectile: 0.5 would be the mean twice, 0 and 1 the extremes.
+EXPECTILES = (0.05, 0.95)
+
+
+class ReturnRange(nn.Module):
+    """
+    A lower and an upper expectile of the return-to-go by the observation (Newey and Powell, 1987), in the trunk's units.
+
+    Returns-to-go outside of it are rare in the training data from such an observation. This matters where the start decides
+    the return, as in Pendulum, and where an agent has fallen and cannot reach the target any more.
+
+    :param observation_dim: O
+    """
+
+    def __init__(self, observation_dim: int) -> None:
+        super().__init__()
+        sizes = (observation_dim, HIDDEN_DIM, HIDDEN_DIM)
+        layers = [layer for i in (0, 1) for layer in (Linear(sizes[i], sizes[i + 1]), nn.LayerNorm(sizes[i + 1]), nn.ReLU())]
+        self.layers = nn.Sequential(*layers, Linear(HIDDEN_DIM, 2))
+
+    def loss(self, observations: th.Tensor, returns_to_go: th.Tensor, mask: th.Tensor) -> th.Tensor:
+        """
+        :param observations: (B, K, O), normalised
+        :param returns_to_go: (B, K), in the trunk's units
+        :param mask: (B, K) bool, False on padded steps
+        :return: sum of both expectile losses, mean over valid steps
+        """
+        missing = returns_to_go.unsqueeze(-1) - self.layers(observations).float()
+        above = missing.new_tensor(EXPECTILES)
+        errors = th.where(missing > 0, above, 1.0 - above) * missing.square()
+        return (errors.sum(dim=-1) * mask).sum() / mask.sum()
+
+    def forward(self, observations: th.Tensor, returns_to_go: th.Tensor) -> th.Tensor:
+        """
+        :param observations: (B, K, O), normalised
+        :param returns_to_go: (B, K)
+        :return: (B, K), clamped to the range
+        """
+        low, high = self.layers(observations).unbind(-1)
+        return returns_to_go.clamp(low, high)
 
 
 class SequenceNetwork(nn.Module):
     """
-    Everything that is trained.
+    From normalised windows to the loss, or to actions in [-1, 1].
 
-    :param trunk: from normalised windows to hidden states
+    :param trunk: from windows to hidden states
     :param head: from hidden states to actions
     :param return_range: what the return-to-go is kept within while acting; None leaves it alone
     :ivar n_macs: multiplications of a step of a window on the way forward, without attention's
@@ -28,23 +70,55 @@ class SequenceNetwork(nn.Module):
         self.return_range = return_range
         self.n_macs = trunk.tokens_per_step * _n_weights(trunk) + _n_weights(head)
 
-    def within_range(self, windows: Windows) -> Windows:
+    def draw_noise(self, batch: Windows, generator: th.Generator) -> tuple[th.Tensor, ...]:
         """
-        Windows whose returns-to-go recordings reached from such observations; in training they are those of recordings.
+        :param batch: as for :meth:`loss`
+        :param generator: on the device of the batch
+        :return: further arguments of :meth:`loss`, see :meth:`ActionHead.draw_noise`
+        """
+        return self.head.draw_noise(chunks_of(batch), generator)
 
-        :param windows: (B, K, ...), normalised
+    def loss(self, batch: Windows, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """
-        if self.return_range is None or self.training:
+        :param batch: normalised, actions in [-1, 1], (B, K + H - 1, A) of them
+        :param noise: of :meth:`draw_noise` for the batch
+        :return: the loss to minimise, and its parts by their logged names
+        """
+        chunks = chunks_of(batch)
+        windows = batch._replace(actions=batch.actions[:, : batch.mask.shape[1]])
+        loss, parts = self.head.loss(self.trunk(**windows._asdict()), chunks, windows.mask, *noise)
+        if self.return_range is not None:
+            parts["return_range_loss"] = self.return_range.loss(windows.observations, windows.returns_to_go, windows.mask)
+            loss = loss + parts["return_range_loss"]
+        return loss, parts
+
+    def within_range(self, windows: Windows) -> Windows:
+        """Windows (B, K, ...) whose returns-to-go recordings reached from such observations."""
+        if self.return_range is None:
             return windows
         return windows._replace(returns_to_go=self.return_range(windows.observations, windows.returns_to_go))
 
+    def newest_hidden(self, windows: Windows) -> th.Tensor:
+        """From windows (B, K, ...) to hidden states (B, D) of their newest steps."""
+        return self.trunk(**self.within_range(windows)._asdict(), last_only=True).squeeze(1)
+
     def extend(self, windows: Windows, cache: np.ndarray) -> tuple[th.Tensor, np.ndarray]:
         """
-        :param windows: (B, K, ...), normalised
+        :param windows: (B, K, ...)
         :param cache: see :func:`~sb3_dtfm.networks.cache.extend_cache`
-        :return: (B, D) hidden states of the newest step, and the new cache
+        :return: (B, D) hidden states of the newest steps, and the new cache
         """
         return extend_cache(self.trunk, self.within_range(windows)._asdict(), cache)
+
+    def decode(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
+        """From hidden states (..., D) and noise (..., N) to chunks (..., H A) in [-1, 1]."""
+        return self.head(hidden, noise).clamp(-1.0, 1.0)
+
+
+def chunks_of(batch: Windows) -> th.Tensor:
+    """From actions (B, K + H - 1, A) to the H from each of K steps on, (B, K, H A), one after the other."""
+    n_actions, n_steps = batch.actions.shape[1], batch.mask.shape[1]
+    return batch.actions.unfold(1, n_actions - n_steps + 1, 1).transpose(2, 3).flatten(2)
 
 
 def _n_weights(network: nn.Module) -> int:

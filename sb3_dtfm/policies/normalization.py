@@ -17,8 +17,8 @@ RETURN_TO_GO_CLIP = 1e3
 RETURN_UNIT, RETURN_CLIP = 4.0, 5.0
 RETURN_SCALINGS = ("timestep", "max")
 OBSERVATION_SCALINGS = ("std", "robust")
-# A dimension whose standard deviation is smaller is a constant, and becomes zero.
-SMALLEST_STD = 1e-6
+# A dimension whose standard deviation is smaller is a constant, and zero for the network whatever it is later.
+SMALLEST_STD = 1e-5
 
 
 class Normalization(nn.Module):
@@ -90,9 +90,9 @@ class Normalization(nn.Module):
         varies = observation_std > SMALLEST_STD
         self.observation_mean.copy_(th.from_numpy(observation_mean))
         self.observation_std.copy_(th.from_numpy(np.where(varies, observation_std, 1.0)))
-        if self.observation_scaling == "robust":
-            gain = np.divide(observation_std, observation_robust_std, out=np.ones_like(observation_std), where=varies)
-            self.observation_gain.copy_(th.from_numpy(gain))
+        gain = np.zeros_like(observation_std)
+        divisor = observation_robust_std if self.observation_scaling == "robust" else observation_std
+        self.observation_gain.copy_(th.from_numpy(np.divide(observation_std, divisor, out=gain, where=varies)))
         self.return_scale.fill_(return_scale if return_scale > 0 else 1.0)
 
     def set_return_to_go_moments(self, moments: th.Tensor) -> None:
@@ -121,6 +121,10 @@ class Normalization(nn.Module):
             observations=self.scale_observation(windows.observations),
             returns_to_go=self._scale_return_to_go(windows.returns_to_go, windows.timesteps),
         )
+
+    def scale_batch(self, batch: Windows) -> Windows:
+        """Windows of a buffer as the network learns from them: normalised, actions in [-1, 1]."""
+        return self(batch._replace(actions=self.scale_action(batch.actions)))
 
     def _scale_return_to_go(self, returns_to_go: th.Tensor, timesteps: th.Tensor) -> th.Tensor:
         """From environment reward units, (B, K), to about [-1, 1]."""

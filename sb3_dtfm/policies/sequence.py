@@ -1,67 +1,44 @@
-"""The policy: its options, the networks that they make, and what these learn by."""
+"""The policy: networks by its options, the optimiser they learn by, and acting with the context of the last steps."""
 
 import copy
-import inspect
 import json
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, ClassVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_dtfm.actions import ActionSpace, vector_space
-from sb3_dtfm.arguments import (
-    BOOLEAN,
-    COUNT,
-    NOT_NEGATIVE,
-    POSITIVE,
-    PROBABILITY_BELOW_1,
-    Choice,
-    Number,
-    Rule,
-    check_arguments,
-    with_nearest,
-)
+from sb3_dtfm.actions import ActionSpace, from_vectors, vector_space
+from sb3_dtfm.arguments import COUNT, NOT_NEGATIVE, check_arguments, with_nearest
 from sb3_dtfm.heads import ActionHead
 from sb3_dtfm.heads.base import NOISE_ROWS
 from sb3_dtfm.networks.optimizer import FlatAdamW, FlatTensors
-from sb3_dtfm.networks.return_range import ReturnRange
 from sb3_dtfm.networks.trunk import SequenceTrunk
-from sb3_dtfm.policies.acting import ActingPolicy, standard_normal
+from sb3_dtfm.policies.context import (
+    Context,
+    check_chunks,
+    check_context,
+    check_episode_start,
+    empty_context,
+    push,
+    restarts,
+    unpack_observation,
+    with_plan,
+)
 from sb3_dtfm.policies.critic import Critic
-from sb3_dtfm.policies.network import SequenceNetwork
-from sb3_dtfm.policies.normalization import OBSERVATION_SCALINGS, RETURN_SCALINGS, Normalization
+from sb3_dtfm.policies.memory import RememberedContext
+from sb3_dtfm.policies.network import ReturnRange, SequenceNetwork
+from sb3_dtfm.policies.normalization import Normalization
+from sb3_dtfm.policies.options import PolicyOptions
 from sb3_dtfm.windows import Windows
 
-ACCEPTED: dict[str, Rule] = {
-    "context_length": COUNT,
-    "max_timestep": COUNT,
-    "embed_dim": COUNT,
-    "n_layers": COUNT,
-    "n_heads": COUNT,
-    "dropout": PROBABILITY_BELOW_1,
-    "timestep_embedding": BOOLEAN,
-    "tokens_per_step": Choice((1, 3)),
-    "chunk_size": COUNT,
-    "weight_decay": NOT_NEGATIVE,
-    "clip_return_to_go": BOOLEAN,
-    "return_range": BOOLEAN,
-    "return_scaling": Choice(RETURN_SCALINGS),
-    "return_conditioning": BOOLEAN,
-    "film_return_to_go": BOOLEAN,
-    "observation_scaling": Choice(OBSERVATION_SCALINGS),
-    "kv_cache": BOOLEAN,
-    "critic_steps": Number(low=0, whole=True),
-    "gamma": PROBABILITY_BELOW_1,
-    "expectile": Number(low=0.5, high=1, below_high=True),
-}
-# What the algorithm gives to the policy by itself; everything else is for `policy_kwargs`.
-FROM_ALGORITHM = ("context_length", "max_timestep", "weight_decay", "ema", "seed")
 
-
-class SequencePolicy(ActingPolicy):
+class SequencePolicy(BasePolicy):
     """
     A policy over the last `context_length` steps: the trunk's hidden state, and a head that makes an action of it.
 
@@ -76,47 +53,17 @@ class SequencePolicy(ActingPolicy):
     :param lr_schedule: learning rate over the progress remaining, from 1 to 0
     :param context_length: K, steps the policy sees
     :param max_timestep: time steps with an embedding of their own
-    :param embed_dim: width of the trunk
-    :param n_layers: number of Transformer blocks
-    :param n_heads: attention heads
-    :param dropout: dropout probability of the trunk
-    :param timestep_embedding: tell the trunk the absolute time step, as Decision Transformer does
-    :param tokens_per_step: 3, return-to-go, observation and action, as Decision Transformer does; or 1, the sum of a step's
-        return-to-go, its observation and the action before it: a third of the products
-    :param chunk_size: H, actions that one hidden state leads to: the newest step's and the next ones (action chunking, Zhao
-        et al., 2023; Chi et al., 2023). 1 is Decision Transformer's
-    :param n_action_steps: how many of them are carried out before the policy looks again, half of them if not given
     :param weight_decay: AdamW's, on weight matrices only
-    :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step. Asking for more than
-        any episode reached, or falling behind, then stays an input like those the policy learned from
-    :param return_range: with `clip_return_to_go`, keep it also within what may be expected from such an observation, see
-        :class:`~sb3_dtfm.networks.return_range.ReturnRange`
-    :param return_scaling: "timestep" or "max", see :class:`~sb3_dtfm.policies.normalization.Normalization`
-    :param return_conditioning: learn and act by the return-to-go; without it, the policy clones what was recorded
-    :param film_return_to_go: let the return-to-go scale and shift what each block of the trunk gets, besides being a token
-    :param observation_scaling: "std" divides observations by their standard deviation, "robust" by the lower quartile of
-        the episodes' standard deviations, for data in which some agents' observations vary far more; see
-        :meth:`EpisodeTable.statistics`
-    :param critic_steps: with each gradient step, how many a critic takes, which learns what actions are worth so that the
-        best of several can be taken, see :class:`~sb3_dtfm.policies.critic.Critic`; trunk and head learn as without. It
-        needs a head that draws; 0 for no critic
-    :param gamma: discount of a step for the critic
-    :param expectile: of the critic
-    :param n_action_samples: N of best-of-N: actions, or chunks, that are sampled, of which the critic takes one; 1 asks
-        no critic
-    :param sample_noise_std: standard deviation of the noise that all but the first of them start from; above 1, which the
-        flow has learned, they differ more, and the critic has more to choose among
-    :param temperature: how much chance that choice leaves, in units of how far actions' values spread in the data; 0, the
-        default, takes the one that both values of the critic find better than the first, by the larger gain
     :param ema: keep an exponential moving average of the weights and act with it
-    :param kv_cache: act on the keys and values kept of earlier steps instead of recomputing the window: two to three times
-        faster, and equal until the window slides (see :meth:`SequenceTrunk.extend`)
     :param seed: seed of the noise that acting starts from
-    :param head_options: options of the head, see its class
+    :param options: of :class:`~sb3_dtfm.policies.options.PolicyOptions` and of the head
     :raises ValueError: an argument out of range or unknown, by name, or an action space that the head does not learn
     """
 
+    observation_space: spaces.Dict
+    action_space: ActionSpace
     head_class: ClassVar[type[ActionHead]]
+    noise_table: th.Tensor
 
     def __init__(
         self,
@@ -125,91 +72,86 @@ class SequencePolicy(ActingPolicy):
         lr_schedule: Schedule,
         context_length: int = 1,
         max_timestep: int = 1000,
-        embed_dim: int = 128,
-        n_layers: int = 3,
-        n_heads: int = 2,
-        dropout: float = 0.0,
-        timestep_embedding: bool = False,
-        tokens_per_step: int = 1,
-        chunk_size: int = 1,
-        n_action_steps: int | None = None,
         weight_decay: float = 1e-3,
-        clip_return_to_go: bool = True,
-        return_range: bool = True,
-        return_scaling: str = "timestep",
-        return_conditioning: bool = True,
-        film_return_to_go: bool = True,
-        observation_scaling: str = "std",
-        critic_steps: int = 0,
-        gamma: float = 0.99,
-        expectile: float = 0.7,
-        n_action_samples: int = 1,
-        sample_noise_std: float = 1.0,
-        temperature: float = 0.0,
         ema: bool = False,
-        kv_cache: bool = False,
         seed: int | None = None,
-        **head_options: Any,
+        **options: Any,
     ) -> None:
         super().__init__(observation_space, action_space, normalize_images=False, optimizer_class=th.optim.AdamW)
-        arguments = {name: value for name, value in locals().items() if name in _own_parameters()}
-        arguments.update(check_arguments(arguments, ACCEPTED))
-        if n_action_steps is None:
-            arguments["n_action_steps"] = (arguments["chunk_size"] + 1) // 2
-        self._check_names(head_options)
+        given = {"context_length": context_length, "max_timestep": max_timestep, "weight_decay": weight_decay}
+        check_arguments(given, {"context_length": COUNT, "max_timestep": COUNT, "weight_decay": NOT_NEGATIVE})
+        self._check_names(options)
         head_class = self.head_for(action_space)
-        self.context_length = context_length
-        self.weight_decay = arguments["weight_decay"]
-        self.kv_cache = arguments["kv_cache"]
-        self.chunk_size = arguments["chunk_size"]
-        if self.chunk_size > 1 and not isinstance(action_space, spaces.Box):
+        of_the_head = {name: options.pop(name) for name in self.head_class.options_class.defaults() if name in options}
+        self.options = PolicyOptions(**options)
+        if self.options.chunk_size > 1 and not isinstance(action_space, spaces.Box):
             raise ValueError(
-                f"chunk_size must be 1 for {action_space}, whose actions are chosen one by one; got {chunk_size}."
+                f"chunk_size must be 1 for {action_space}, whose actions are chosen one by one; "
+                f"got {self.options.chunk_size}."
             )
-        arguments.update(check_arguments(arguments, self._acting_rules()))
-        self.n_action_steps = arguments["n_action_steps"]
-        self.n_action_samples, self.sample_noise_std = arguments["n_action_samples"], arguments["sample_noise_std"]
-        self.temperature = arguments["temperature"]
-        self._constructor_arguments = {**arguments, **self.head_class.options(), **head_options}
+        self.context_length = context_length
+        self.weight_decay = weight_decay
         self.seed = seed
         self.observation_dim = int(observation_space["observation"].shape[0])  # type: ignore[index]
         self.vector_space = vector_space(action_space)
         self.action_dim = int(self.vector_space.shape[0])
-        units = (self.observation_dim, self.vector_space, max_timestep)
-        scaling = return_scaling if return_conditioning else None
-        self.normalization = Normalization(*units, clip_return_to_go, scaling, observation_scaling)
-        sizes = (self.observation_dim, self.action_dim, max_timestep, embed_dim, n_layers, n_heads)
-        film = film_return_to_go and return_conditioning
-        trunk = SequenceTrunk(*sizes, dropout, timestep_embedding, tokens_per_step, film)
-        head = head_class(embed_dim, self.chunk_size * self.action_dim, **head_options)
-        ranged = return_range and clip_return_to_go and return_conditioning
-        self.network = SequenceNetwork(trunk, head, ReturnRange(self.observation_dim) if ranged else None)
+        self.normalization = self._make_normalization(max_timestep)
+        self.network = self._make_network(head_class, of_the_head)
+        self._constructor_arguments = {
+            **given, "ema": ema, "seed": seed, **vars(self.options), **vars(self.network.head.options)
+        }  # fmt: skip
         self.ema_network = copy.deepcopy(self.network).requires_grad_(False) if ema else None
         self.optimizer: FlatAdamW = self._make_optimizer(lr_schedule(1.0))
         averaged = dict(zip(self.network.parameters(), self.acting_network.parameters(), strict=True))
         self._averaged = FlatTensors(averaged[parameter] for parameter in self.optimizer.parameters)
         generator = th.Generator().manual_seed(0 if seed is None else seed)
         self.register_buffer("noise_table", self.network.head.deterministic_noise(generator))
-        self.gamma, self.critic_steps = gamma, arguments["critic_steps"]
-        self.critic_horizon = self.n_action_steps  # actions that the critic values together: those that are carried out
-        self.critic = None
-        if self.critic_steps:  # made last: the weights of all else are what they are without
+        self.critic_horizon = self.options.n_action_steps  # the critic values the actions that are carried out together
+        self.critic: Critic | None = None
+        if self.options.critic_steps:  # made last: the weights of all else are what they are without
             if self.network.head.noise_dim == 0:
                 raise ValueError(
-                    f"critic_steps={critic_steps}: the critic has nothing to choose among: {self.head_class.algorithm} "
-                    "makes one action of what it sees, where DTFM draws."
+                    f"critic_steps={self.options.critic_steps}: the critic has nothing to choose among: "
+                    f"{self.head_class.algorithm} makes one action of what it sees, where DTFM draws."
                 )
-            self.critic = Critic(self.observation_dim, self.critic_horizon * self.action_dim, expectile=expectile)
-        self._check_candidates(self.n_action_samples)
+            sizes = (self.observation_dim, self.critic_horizon * self.action_dim)
+            self.critic = Critic(*sizes, expectile=self.options.expectile)
+        self.online_actor: nn.Module | None = None  # fine-tuned models have one, see sb3_dtfm.finetuning
+        self._acting_generator: th.Generator | None = None
+        self._remembered = RememberedContext()
+
+    def _make_normalization(self, max_timestep: int) -> Normalization:
+        own = self.options
+        scaling = own.return_scaling if own.return_conditioning else None
+        sizes = (self.observation_dim, self.vector_space, max_timestep)
+        return Normalization(*sizes, own.clip_return_to_go, scaling, own.observation_scaling)
+
+    def _make_network(self, head_class: type[ActionHead], of_the_head: dict[str, Any]) -> SequenceNetwork:
+        own = self.options
+        trunk = SequenceTrunk(
+            self.observation_dim,
+            self.action_dim,
+            self.normalization.max_timestep,
+            own.embed_dim,
+            own.n_layers,
+            own.n_heads,
+            own.dropout,
+            own.timestep_embedding,
+            own.tokens_per_step,
+            own.film_return_to_go and own.return_conditioning,
+        )
+        head = head_class(own.embed_dim, own.chunk_size * self.action_dim, **of_the_head)
+        ranged = own.return_range and own.clip_return_to_go and own.return_conditioning
+        return SequenceNetwork(trunk, head, ReturnRange(self.observation_dim) if ranged else None)
 
     @classmethod
     def parameter_names(cls) -> set[str]:
-        """What `policy_kwargs` may hold: the trunk's and the head's options."""
-        return (_own_parameters() - set(FROM_ALGORITHM)) | set(cls.head_class.options())
+        """What `policy_kwargs` may hold: options of the policy and of its head."""
+        return set(PolicyOptions.defaults()) | set(cls.head_class.options_class.defaults())
 
     @classmethod
-    def _check_names(cls, head_options: dict[str, Any]) -> None:
-        unknown = sorted(set(head_options) - set(cls.head_class.options()))
+    def _check_names(cls, options: dict[str, Any]) -> None:
+        unknown = sorted(set(options) - cls.parameter_names())
         if unknown:
             accepted = sorted(cls.parameter_names())
             named = with_nearest(unknown, accepted)
@@ -260,37 +202,26 @@ class SequencePolicy(ActingPolicy):
             state_dict = {**weights, **averaged}
         return super().load_state_dict(state_dict, strict, assign)
 
-    def scaled_windows(self, batch: Windows) -> Windows:
-        """The windows of a buffer, with actions in [-1, 1]."""
-        return batch._replace(actions=self.normalization.scale_action(batch.actions))
-
-    def draw_noise(self, batch: Windows, generator: th.Generator) -> tuple[th.Tensor, ...]:
-        """What the head's loss draws at random for a batch, see :meth:`ActionHead.draw_noise`."""
-        return self.network.head.draw_noise(self._chunks(batch.actions), generator)
-
-    def part_masks(self, mask: th.Tensor) -> dict[str, th.Tensor]:
-        """See :meth:`ActionHead.part_masks`."""
-        return self.network.head.part_masks(mask)
-
-    def compute_loss(self, batch: Windows, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+    def update_ema(self, decay: float) -> None:
         """
-        :param batch: windows of a buffer, actions in the environment's range, (B, K + H - 1, A) of them
-        :param noise: what :meth:`draw_noise` gave for the batch
-        :return: the loss to minimise, and its parts by their logged names
-        """
-        windows = self.scaled_windows(batch)
-        chunks = self._chunks(windows.actions)
-        windows = windows._replace(actions=windows.actions[:, : windows.mask.shape[1]])
-        seen = self.normalization(windows)
-        loss, parts = self.network.head.loss(self.network.trunk(**seen._asdict()), chunks, windows.mask, *noise)
-        if self.network.return_range is not None:
-            parts["return_range_loss"] = self.network.return_range.loss(seen.observations, seen.returns_to_go, seen.mask)
-            loss = loss + parts["return_range_loss"]
-        return loss, parts
+        Move the acting weights towards the trained ones.
 
-    def _chunks(self, actions: th.Tensor) -> th.Tensor:
-        """From actions (B, K + H - 1, A) to the H from each of K steps on, (B, K, H A), one after the other."""
-        return actions.unfold(1, self.chunk_size, 1).transpose(2, 3).flatten(2)
+        :param decay: share of the old average that stays
+        """
+        self._averaged.flat().lerp_(self.optimizer.flat_weights(), 1.0 - decay)
+
+    @property
+    def acting_network(self) -> SequenceNetwork:
+        """The weights that choose actions: the moving average if there is one."""
+        return self.network if self.ema_network is None else self.ema_network
+
+    def newest_hidden(self, batch: Windows) -> th.Tensor:
+        """
+        :param batch: windows of a buffer, (B, K, ...)
+        :return: hidden states (B, D) of their newest steps, by the network that acts
+        """
+        self._stop_training()
+        return self.acting_network.newest_hidden(self.normalization.scale_batch(batch))
 
     def action_mse(self, batch: Windows, generator: th.Generator) -> th.Tensor:
         """
@@ -301,58 +232,286 @@ class SequencePolicy(ActingPolicy):
         :param batch: windows of a buffer
         :param generator: source of the noise that actions start from
         """
-        self.set_training_mode(False)
         with th.no_grad():
-            windows = self.scaled_windows(batch)
-            network = self.acting_network
-            hidden = self.hidden_states(network, windows, last_only=True).squeeze(1)
-            actions = network.head(hidden, standard_normal(len(hidden), network.head.noise_dim, generator)).clamp(-1.0, 1.0)
-            return (actions[:, : self.action_dim] - windows.actions[:, -1]).square().mean()
+            hidden = self.newest_hidden(batch)
+            noise = standard_normal(len(hidden), self.network.head.noise_dim, generator)
+            actions = self.acting_network.decode(hidden, noise)[:, : self.action_dim]
+            return (actions - self.normalization.scale_action(batch.actions[:, -1])).square().mean()
 
     def best_of_n_share(self, batch: Windows, generator: th.Generator) -> th.Tensor:
         """
-        How often the critic has another candidate taken than the first one, at the newest steps of windows.
+        How often the critic has another sample taken than the first one, at the newest steps of windows.
 
         :param batch: windows of a buffer
         :param generator: decides which rows of the noise table
         """
-        self.set_training_mode(False)
         with th.no_grad():
-            hidden = self.hidden_states(self.acting_network, self.scaled_windows(batch), last_only=True).squeeze(1)
+            hidden = self.newest_hidden(batch)
             rows = th.randint(NOISE_ROWS, (len(hidden),), generator=generator, device=generator.device).cpu().numpy()
-            _, chosen = self._draw_candidates(hidden, batch.observations[:, -1], rows, deterministic=True)
+            _, chosen = self._best_of_n(hidden, batch.observations[:, -1], rows, deterministic=True)
             return (chosen != 0).float().mean()
 
-    def update_ema(self, decay: float) -> None:
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
-        Move the acting weights towards the trained ones.
+        Choose actions with the whole context.
 
-        :param decay: share of the old average that stays
+        With `state` or `episode_start` given this is a pure function: a context belongs to whoever passes it on. With
+        neither, the policy remembers the context of one caller, so that `action, _ = model.predict(obs)` in a loop is
+        enough: a row starts anew where its time step is not the last one plus one, and is asked again where both time step
+        and observation are the last ones. :meth:`reset` forgets it.
+
+        Actions are finite and inside the action space. What cannot be acted on is an error before anything has changed: the
+        caller mends the row that it names, or begins it anew, and asks again; the other rows go on as if nothing had been.
+
+        :param observation: Dict of `observation` (O,), `return_to_go` (1,), `timestep` (1,), or with a leading axis B
+        :param state: what the last call returned
+        :param episode_start: (B,) bool, True where an environment was just reset
+        :param deterministic: repeat exactly for the same model, state and inputs; otherwise draw fresh noise
+        :return: actions (A,) or (B, A) in the environment's range, of a Discrete space () or (B,), and the next state
+        :raises ValueError: not the observation of a `ReturnToGoWrapper`; a number that is not finite or a time step that is
+            none, by key and row; a state of other environments, or one that holds no finite numbers
         """
-        self._averaged.flat().lerp_(self.optimizer.flat_weights(), 1.0 - decay)
+        arrays, vectorized = unpack_observation(observation, self.observation_dim)
+        n_rows, timestep = len(arrays[0]), arrays[2]
+        remembers = state is None and episode_start is None
+        if episode_start is not None:
+            episode_start = check_episode_start(episode_start, n_rows)
+        before = self._known(self._remembered.recall(arrays[0], timestep) if remembers else state, n_rows)
+        lost = restarts(before, timestep) & (timestep > 0)
+        if episode_start is not None:
+            lost &= ~episode_start
+        if lost.any():
+            self._remembered.warn(f"Time step {timestep[lost][0]} follows none that is known: its past is missing.")
+        context = push(before, *arrays, episode_start=episode_start)
+        context = self._act(context, deterministic)
+        action = self._to_environment(context.actions[:, -1])
+        if remembers:
+            context = self._remembered.remember(before, context)
+        return action if vectorized else action.squeeze(axis=0), context
+
+    def _known(self, state: tuple[np.ndarray, ...] | None, n_rows: int) -> Context:
+        """The context to go on from; a plan for another number of steps than are planned now is dropped."""
+        nothing = self._empty_context(n_rows)
+        if state is None:
+            return nothing
+        before = check_context(state, nothing)
+        if before.plan.shape != nothing.plan.shape:
+            before = before._replace(plan=nothing.plan, n_planned=nothing.n_planned)
+        return before
+
+    def encode(
+        self,
+        observation: dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+    ) -> tuple[Context, th.Tensor]:
+        """
+        The first half of acting, for a caller who chooses the noise: :meth:`decode` is the second one.
+
+        A pure function, as `predict` with a `state`.
+
+        :param observation: as for :meth:`predict`
+        :param state: what :meth:`decode` or :meth:`predict` returned; None for no past
+        :param episode_start: (B,) bool, True where an environment was just reset
+        :return: the context with the newest step, and the trunk's hidden states (B, D)
+        :raises ValueError: as :meth:`predict`
+        """
+        arrays, _ = unpack_observation(observation, self.observation_dim)
+        n_rows = len(arrays[0])
+        if episode_start is not None:
+            episode_start = check_episode_start(episode_start, n_rows)
+        context = push(self._known(state, n_rows), *arrays, episode_start=episode_start)
+        self._stop_training()
+        with th.inference_mode():
+            hidden, keys_values = self._hidden(context, np.ones(n_rows, bool))
+        assert hidden is not None
+        return context._replace(keys_values=keys_values), hidden
+
+    def decode(self, context: Context, hidden: th.Tensor, noise: np.ndarray) -> tuple[np.ndarray, Context]:
+        """
+        The second half: what this noise leads to. Whatever was planned before is dropped.
+
+        :param context: what :meth:`encode` returned, with `hidden`
+        :param hidden: (B, D)
+        :param noise: (B, N), for the head's `noise_dim`
+        :return: actions of this step and of those planned, (B, n_action_steps, A) in the environment's range, and the next
+            `state`; until it is `encode`'s turn again, `predict` gives the planned ones
+        :raises ValueError: noise that leads to no finite action
+        """
+        with th.inference_mode():
+            chosen = self.acting_network.decode(hidden, th.as_tensor(noise, dtype=th.float32, device=hidden.device))
+            chunks = self._to_chunks(chosen)
+        return self.apply_actions(context, chunks)
+
+    def default_noise(self, context: Context) -> np.ndarray:
+        """
+        The noise that `predict(deterministic=True)` begins with.
+
+        :param context: what :meth:`encode` returned
+        :return: (B, N)
+        """
+        return self._acting_noise(context.timesteps[:, -1] + context.episode_keys, deterministic=True).cpu().numpy()
+
+    def apply_actions(self, context: Context, chunks: np.ndarray) -> tuple[np.ndarray, Context]:
+        """
+        What comes of actions that somebody else has chosen.
+
+        :param context: what :meth:`encode` returned
+        :param chunks: (B, h, A) in [-1, 1], for at least the `n_action_steps` that are carried out
+        :return: as :meth:`decode`
+        :raises ValueError: they are not finite
+        """
+        context = self._carry_out(context, np.ones(len(chunks), bool), chunks)
+        planned = np.concatenate([context.actions[:, -1:], context.plan], axis=1)
+        return self._to_environment(planned), context
+
+    def reset(self) -> None:
+        """Forget the context that `predict` remembers for a caller who passes no `state`."""
+        self._remembered.forget()
+
+    def _to_environment(self, scaled_action: np.ndarray) -> np.ndarray:
+        """From [-1, 1] into the action space, in its own precision."""
+        low, high = self.vector_space.low, self.vector_space.high
+        action = (low + 0.5 * (scaled_action + 1.0) * (high - low)).astype(self.vector_space.dtype)
+        return from_vectors(np.clip(action, low, high), self.action_space)
+
+    def _empty_context(self, n_rows: int) -> Context:
+        sizes = (self.context_length, self.observation_dim, self.action_dim)
+        return empty_context(n_rows, *sizes, plan_length=self.options.n_action_steps - 1)
+
+    def _act(self, context: Context, deterministic: bool) -> Context:
+        """
+        Fill in the newest step's actions, in [-1, 1]: planned ones, and chosen ones where none are left.
+
+        :raises ValueError: they would not be finite
+        """
+        self._stop_training()
+        due = context.n_planned == 0
+        chunks = np.zeros((0, self.options.chunk_size, self.action_dim), np.float32)
+        with th.inference_mode():
+            hidden, keys_values = self._hidden(context, due)
+            if hidden is not None:
+                chunks = self._to_chunks(self._choose(context, due, hidden, deterministic))
+        return self._carry_out(context, due, chunks)._replace(keys_values=keys_values)
+
+    def _stop_training(self) -> None:
+        if self.training:
+            self.set_training_mode(False)  # goes through all modules
+
+    def _carry_out(self, context: Context, due: np.ndarray, chunks: np.ndarray) -> Context:
+        """
+        The newest step's actions, and plans for the next ones.
+
+        :param due: (B,) bool, b rows that have new actions
+        :param chunks: (b, H, A) in [-1, 1]
+        :raises ValueError: they are not finite
+        """
+        check_chunks(context, due, chunks)
+        return with_plan(context, due, chunks[:, : self.options.n_action_steps])
+
+    @property
+    def takes_best_of_n(self) -> bool:
+        """Whether the critic chooses among several samples as the policy acts now."""
+        return self.options.n_action_samples > 1 and self.online_actor is None
+
+    def _choose(self, context: Context, due: np.ndarray, hidden: th.Tensor, deterministic: bool) -> th.Tensor:
+        """
+        :param due: (B,) bool, rows that need new actions, b of them
+        :param hidden: (b, D)
+        :return: (b, H A) in [-1, 1]
+        """
+        rows = context.timesteps[due, -1] + context.episode_keys[due]
+        newest = Windows(*(th.from_numpy(each[due, -1:]).to(hidden.device) for each in context.windows))
+        if self.takes_best_of_n:
+            samples, chosen = self._best_of_n(hidden, newest.observations[:, 0], rows, deterministic)
+            return samples[th.arange(len(chosen), device=hidden.device), chosen]
+        noise = self._acting_noise(rows, deterministic).to(hidden.device)
+        return choose_actions(self.acting_network, self.normalization, self.online_actor, newest, hidden, noise)
+
+    def _best_of_n(
+        self, hidden: th.Tensor, observations: th.Tensor, rows: np.ndarray, deterministic: bool
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param hidden: (b, D)
+        :param observations: (b, O) as the environment gives them
+        :param rows: (b,) of the noise table
+        :return: see :meth:`Critic.best_of_n`
+        """
+        assert self.critic is not None
+        own = self.options
+        repeated = hidden.unsqueeze(1).expand(-1, own.n_action_samples, -1)
+        return self.critic.best_of_n(
+            self.normalization.scale_observation(observations),
+            rows,
+            partial(self._acting_noise, deterministic=deterministic),
+            partial(self.acting_network.decode, repeated),
+            own.n_action_samples,
+            own.sample_noise_std,
+            own.temperature,
+        )
+
+    def _hidden(self, context: Context, due: np.ndarray) -> tuple[th.Tensor | None, np.ndarray]:
+        """
+        :param due: (B,) bool, rows that need new actions, b of them
+        :return: hidden states (b, D) of the newest steps, None where none is due; and the keys and values to keep, which
+            grow with each step, due or not
+        """
+        caches = self.options.kv_cache and self.context_length > 1
+        keys_values = np.zeros((len(due), 0), np.float32)
+        if not caches and not due.any():
+            return None, keys_values
+        device = self.device  # SB3 looks for it among the parameters each time
+        windows = Windows(*(th.from_numpy(each if caches else each[due]).to(device) for each in context.windows))
+        if not caches:
+            return self.acting_network.newest_hidden(self.normalization(windows)), keys_values
+        hidden, keys_values = self.acting_network.extend(self.normalization(windows), context.keys_values)
+        return (hidden[th.from_numpy(due).to(device)] if due.any() else None), keys_values
+
+    def _to_chunks(self, actions: th.Tensor) -> np.ndarray:
+        """From (b, H A) to (b, H, A) on the CPU."""
+        return actions.cpu().numpy().reshape(-1, self.options.chunk_size, self.action_dim)
+
+    def _acting_noise(self, rows: np.ndarray, deterministic: bool) -> th.Tensor:
+        """What the newest step's actions start from, (B, noise_dim): of these rows of the table, (B,), or fresh."""
+        if deterministic or self.network.head.noise_dim == 0:
+            return self.noise_table[th.from_numpy(rows % len(self.noise_table)).to(self.noise_table.device)]
+        if self._acting_generator is None:
+            self.seed_noise(self.seed)
+        assert self._acting_generator is not None
+        return standard_normal(len(rows), self.network.head.noise_dim, self._acting_generator)
+
+    def seed_noise(self, seed: int | None) -> None:
+        """
+        Start the noise of `deterministic=False` anew.
+
+        :param seed: None draws one
+        """
+        self._acting_generator = th.Generator(self.device)
+        if seed is None:
+            self._acting_generator.seed()
+        else:
+            self._acting_generator.manual_seed(seed)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        """Actions (B, A) in the environment's range for single steps without a past."""
+        assert isinstance(observation, dict)
+        numbers = {key: value.cpu().numpy() for key, value in observation.items()}
+        arrays, _ = unpack_observation(numbers, self.observation_dim)
+        context = self._act(push(self._empty_context(len(arrays[0])), *arrays), deterministic)
+        return th.as_tensor(self._to_environment(context.actions[:, -1]), device=self.device)
+
+    def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self._predict(observation, deterministic)
 
     def acting_settings(self) -> dict[str, Any]:
         """How to act: what may be changed after training, and is saved with the weights."""
-        head = self.network.head
-        own = {name: getattr(self, name) for name in self._acting_rules()}
-        return {**own, **{name: getattr(head, name) for name in head.acting_choices}}
-
-    def _acting_rules(self) -> dict[str, Rule]:
-        """The policy's own ways of acting; the others are the head's."""
-        return {
-            "kv_cache": BOOLEAN,
-            "n_action_steps": Number(low=1, high=self.chunk_size, whole=True),
-            "n_action_samples": Number(low=1, high=NOISE_ROWS, whole=True),
-            "sample_noise_std": POSITIVE,
-            "temperature": NOT_NEGATIVE,
-        }
-
-    def _check_candidates(self, n_action_samples: int) -> None:
-        if n_action_samples > 1 and self.critic is None:
-            raise ValueError(
-                f"n_action_samples={n_action_samples} needs a model that was trained with "
-                "policy_kwargs=dict(critic_steps=...)."
-            )
+        return {**self.options.acting(), **self.network.head.options.acting()}
 
     def set_acting(self, **settings: Any) -> None:
         """
@@ -361,21 +520,14 @@ class SequencePolicy(ActingPolicy):
         :param settings: some of :meth:`acting_settings`
         :raises ValueError: an unknown name, or a value out of range
         """
-        unknown = sorted(set(settings) - set(self.acting_settings()))
+        accepted = self.acting_settings()
+        unknown = sorted(set(settings) - set(accepted))
         if unknown:
-            accepted = self.acting_settings()
             raise ValueError(f"{with_nearest(unknown, accepted)}: no way of acting; accepted are {', '.join(accepted)}.")
-        settings = {**self.acting_settings(), **settings}
-        own = check_arguments(settings, self._acting_rules())
-        self._check_candidates(own["n_action_samples"])
-        if self.online_actor is not None and self.online_actor.residual:
-            self.check_residual_actions(own["n_action_steps"])
-        heads = self.network.head.check_acting(**{name: settings[name] for name in self.network.head.acting_choices})
-        for name, value in own.items():
-            setattr(self, name, value)
-        for name, value in heads.items():
-            setattr(self.network.head, name, value)
-            setattr(self.acting_network.head, name, value)
+        head = self.network.head
+        of_the_head = {name: settings.pop(name) for name in head.options.acting() if name in settings}
+        self.options, options = self.options.changed(**settings), head.options.changed(**of_the_head)
+        head.options = self.acting_network.head.options = options
 
     def get_extra_state(self) -> th.Tensor:
         """The settings of acting as JSON, to be saved with the weights; in a tensor, as all of a state dict is."""
@@ -396,20 +548,32 @@ class SequencePolicy(ActingPolicy):
         )
         return {**spaces_and_schedule, **self._constructor_arguments}  # how it acts is among the weights
 
-    def save(self, path: str) -> None:
-        """
-        SB3's: the policy alone.
 
-        :param path: file to write
-        :raises ValueError: it is finetuned, which only the model's own file can hold
-        """
-        if self.online_actor is not None:
-            raise ValueError("A fine-tuned policy is saved with its model: model.save(path).")
-        super().save(path)
+def choose_actions(
+    network: SequenceNetwork,
+    normalization: Normalization,
+    online_actor: nn.Module | None,
+    newest: Windows,
+    hidden: th.Tensor,
+    noise: th.Tensor,
+) -> th.Tensor:
+    """
+    From hidden states and noise to actions: what `predict` and exported files do alike.
+
+    :param network: that acts
+    :param normalization: of the policy
+    :param online_actor: of a fine-tuned model; None takes the noise and the actions as they are
+    :param newest: (B, 1, ...), the newest steps in the environment's units
+    :param hidden: (B, D)
+    :param noise: (B, N), standard normal
+    :return: (B, H A) in [-1, 1]
+    """
+    decode = partial(network.decode, hidden)
+    if online_actor is None:
+        return decode(noise)
+    actions: th.Tensor = online_actor(normalization, newest, hidden, noise, decode)
+    return actions
 
 
-def _own_parameters() -> set[str]:
-    """The policy's own arguments, without the head's and without what every SB3 policy has."""
-    parameters = inspect.signature(SequencePolicy.__init__).parameters.values()
-    given_by_sb3 = ("self", "observation_space", "action_space", "lr_schedule")
-    return {each.name for each in parameters if each.kind is not each.VAR_KEYWORD and each.name not in given_by_sb3}
+def standard_normal(n_rows: int, dim: int, generator: th.Generator) -> th.Tensor:
+    return th.randn(n_rows, dim, generator=generator, device=generator.device)

@@ -106,11 +106,11 @@ def keep_one_action(policy: SequencePolicy, residual: bool) -> None:
     if not residual and policy.network.head.noise_dim and not policy.network.head.noise_decides:
         policy.set_acting(flow_steps=NOISE_SPACE_FLOW_STEPS)
         print(f"The model acts by one Euler step, which no noise changes: flow_steps={NOISE_SPACE_FLOW_STEPS} instead")
-    if residual and policy.n_action_steps > 1:
-        print(f"n_action_steps={policy.n_action_steps} becomes 1: a residual action is added to each action")
+    if residual and policy.options.n_action_steps > 1:
+        print(f"n_action_steps={policy.options.n_action_steps} becomes 1: a residual action is added to each action")
         policy.set_acting(n_action_steps=1)
-    if policy.n_action_samples > 1:
-        print(f"n_action_samples={policy.n_action_samples} becomes 1: the online algorithm chooses the noise")
+    if policy.options.n_action_samples > 1:
+        print(f"n_action_samples={policy.options.n_action_samples} becomes 1: the online algorithm chooses the noise")
         policy.set_acting(n_action_samples=1)
 
 

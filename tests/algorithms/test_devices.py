@@ -35,14 +35,15 @@ def test_a_gradient_step_makes_nothing_on_the_cpu_for_another_device(
     """A number that moves from the CPU holds the GPU's queue up. PyTorch's "meta" device computes shapes alone."""
     policy_kwargs = {"flow_prediction": flow_prediction} if algorithm is DTFM else {}
     policy_kwargs["tokens_per_step"] = tokens_per_step
-    policy = make_model(algorithm, cheetah_buffer, precision="float32", policy_kwargs=policy_kwargs).policy.to("meta")
+    model = make_model(algorithm, cheetah_buffer, precision="float32", policy_kwargs=policy_kwargs)
+    policy = model.policy.to("meta")
     policy.set_training_mode(True)
     batch = cheetah_buffer.sample(4, 5, th.Generator().manual_seed(0))
-    noise = policy.draw_noise(batch, th.Generator().manual_seed(0))
+    noise = policy.network.draw_noise(batch, th.Generator().manual_seed(0))
     batch = type(batch)(*(tensor.to("meta") for tensor in batch))
     noise = [tensor.to("meta") for tensor in noise]
     with OperationsOnTheCpu() as operations:
-        loss, _ = policy.compute_loss(batch, *noise)
+        loss, _ = model.compute_loss(batch, *noise)
         loss.backward()
     assert loss.device.type == "meta"
     assert operations.found == []

@@ -58,14 +58,14 @@ def test_the_end_of_learning_looks_once_more(cheetah_buffer, monkeypatch):
 def test_the_error_names_step_episodes_and_the_last_checkpoint(cheetah_buffer, tmp_path, monkeypatch):
     """And comes before the callbacks of its step: no checkpoint is of that step."""
     model = make_model(DT, cheetah_buffer, batch_size=1)
-    compute_loss = model.policy.compute_loss
+    compute_loss = model.compute_loss
     sick = cheetah_buffer.observations[3 * EPISODE_LENGTH : 4 * EPISODE_LENGTH]
 
     def spoiled(batch, *noise):
         loss, parts = compute_loss(batch, *noise)
         return loss * (float("nan") if (batch.observations[0, -1] == sick).all(dim=1).any() else 1.0), parts
 
-    monkeypatch.setattr(model.policy, "compute_loss", spoiled)
+    monkeypatch.setattr(model, "compute_loss", spoiled)
     with pytest.raises(FloatingPointError, match="loss became nan") as caught:
         model.learn(100, callback=CheckpointCallback(1, str(tmp_path)))
     n_good = model.num_timesteps

@@ -47,7 +47,7 @@ def test_the_same_batches_and_noise_give_the_losses_of_before(algorithm):
     losses = []
     for batch in (model.buffer.windows(each, 5) for each in ends):
         policy.optimizer.zero_grad()
-        loss, _ = policy.compute_loss(batch, *noise_of_before(batch.actions, generator) if algorithm is DTFM else ())
+        loss, _ = model.compute_loss(batch, *noise_of_before(batch.actions, generator) if algorithm is DTFM else ())
         loss.backward()
         policy.optimizer.step()
         policy.update_ema(0.9)

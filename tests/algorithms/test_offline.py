@@ -208,16 +208,17 @@ def test_action_prediction_and_tau_near_the_noise_train_and_are_saved(cheetah_bu
     policy_kwargs = {**TINY_FLOW_POLICY, "flow_prediction": "action", "flow_tau_exponent": 2.0}
     model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, context_length=3, policy_kwargs=policy_kwargs, seed=0)
     batch = model.buffer.sample(4, 3, th.Generator().manual_seed(0))
-    noise, tau = model.policy.draw_noise(batch, th.Generator().manual_seed(0))
+    noise, tau = model.policy.network.draw_noise(batch, th.Generator().manual_seed(0))
     assert (noise.shape, tau.shape) == ((4, 3, 6), (4, 3))
-    model.policy.network.head.flow_tau_exponent = 1.0
-    _, uniform = model.policy.draw_noise(batch, th.Generator().manual_seed(0))
+    head = model.policy.network.head
+    head.options = head.options.changed(flow_tau_exponent=1.0)
+    _, uniform = model.policy.network.draw_noise(batch, th.Generator().manual_seed(0))
     th.testing.assert_close(tau, uniform.square())
-    model.policy.network.head.flow_tau_exponent = 2.0
+    head.options = head.options.changed(flow_tau_exponent=2.0)
     model.learn(3).save(tmp_path / "model")
     head = DTFM.load(tmp_path / "model").policy.network.head
     assert head.regression is not None
-    assert head.flow_tau_exponent == 2.0
+    assert head.options.flow_tau_exponent == 2.0
 
 
 @pytest.mark.parametrize(("algorithm", "policy_kwargs"), ALGORITHMS, ids=IDS)

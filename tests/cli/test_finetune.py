@@ -174,7 +174,7 @@ def test_ppo_corrects_a_zip_file_with_a_target_of_its_own(run, workplace, capsys
     agent = PPO.load(finetuned / "agent")
     np.testing.assert_array_equal(agent.policy.action_net.weight.detach(), model.policy.online_actor.mean.weight)
     assert model.online_actor["residual"]
-    assert model.policy.n_action_steps == 1
+    assert model.policy.options.n_action_steps == 1
     output = capsys.readouterr().out
     assert "PPO adds residual actions to those of alone.zip" in output
     assert "n_action_steps=2 becomes 1: a residual action is added to each action" in output

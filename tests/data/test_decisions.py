@@ -118,15 +118,23 @@ def test_white_noise_takes_back_half_of_what_it_did():
 def test_what_a_user_gives_counts():
     buffer = make_buffer("planner")
     given = DTFM("MultiInputPolicy", dataset=buffer, batch_size=32, policy_kwargs={"flow_steps": 0}, device="cpu")
-    assert (given.batch_size, given.policy.acting_settings()["flow_steps"], given.policy.chunk_size) == (32, 0, 8)
+
+    def settings(model: DTFM) -> tuple:
+        return model.batch_size, model.policy.network.head.options.flow_steps, model.policy.options.chunk_size
+
+    assert settings(given) == (32, 0, 8)
     decided = DTFM("MultiInputPolicy", dataset=buffer, device="cpu")
-    assert (decided.batch_size, decided.policy.acting_settings()["flow_steps"], decided.policy.chunk_size) == (64, 10, 8)
+    assert (decided.batch_size, decided.policy.acting_settings()["flow_steps"], decided.policy.options.chunk_size) == (
+        64,
+        10,
+        8,
+    )
 
 
 def test_what_is_decided_goes_with_what_a_user_gives():
     def loss_and_steps(kind: str, **policy_kwargs) -> tuple:
         model = DTFM("MultiInputPolicy", dataset=make_buffer(kind), policy_kwargs=policy_kwargs, device="cpu")
-        return model.policy.network.head.regression_coef, model.policy.network.head.flow_steps
+        return model.policy.network.head.options.regression_coef, model.policy.network.head.options.flow_steps
 
     assert loss_and_steps("planner", flow_steps=5) == (0.0, 5)
     assert loss_and_steps("planner", flow_steps=0) == (1.0, 0)

@@ -56,7 +56,7 @@ def test_noise_is_a_draw_of_the_actors_own_distribution(model, algorithm, hidden
         else:
             distribution = agent.policy.get_distribution(shown).distribution
             expected = (distribution.mean + distribution.stddev * drawn).clamp(-1.5, 1.5)
-    th.testing.assert_close(finetuned.policy.online_actor(shown, drawn), expected)
+    th.testing.assert_close(finetuned.policy.online_actor.choose(shown, drawn), expected)
     _, context = model.policy.decode(*env._known, expected.numpy())
     observations = make_venv().reset()
     actions, _ = finetuned.predict(observations, episode_start=np.ones(3, bool), deterministic=True)
@@ -77,7 +77,7 @@ def test_a_finetuned_model_plays_in_the_environment_what_its_noise_plays_in_the_
     for _ in range(20):
         with th.no_grad():
             drawn = th.as_tensor(table_noise(model.policy, env._known[0]))
-            noise = finetuned.policy.online_actor(th.as_tensor(shown), drawn).numpy()
+            noise = finetuned.policy.online_actor.choose(th.as_tensor(shown), drawn).numpy()
         shown, _, dones, infos = env.step(noise)
         for row in np.flatnonzero(dones):
             found[row].append(infos[row]["terminal_observation"][17] * model.policy.normalization.return_scale.item())

@@ -139,7 +139,7 @@ def test_the_last_observation_of_an_episode_has_its_own_hidden_state(model):
     noise = np.random.default_rng(0).normal(size=(3, *ended.action_space.shape))
     for env in (ended, going_on):
         env.reset()
-    decisions = 7 if model.policy.n_action_steps == 1 else 3
+    decisions = 7 if model.policy.options.n_action_steps == 1 else 3
     for _ in range(decisions - 1):
         ended.step(noise)
         going_on.step(noise)
@@ -148,7 +148,7 @@ def test_the_last_observation_of_an_episode_has_its_own_hidden_state(model):
     assert dones[0]
     going_on.step_async(noise)
     observations, _, _, steps = going_on.venv.step_wait()
-    if model.policy.n_action_steps > 1:  # the seventh step is the first one of the third chunk
+    if model.policy.options.n_action_steps > 1:  # the seventh step is the first one of the third chunk
         observations = {key: value[:, 0] for key, value in _stacked(steps).items()}
     shown = going_on._show(*policy.encode(observations, going_on._acted))
     np.testing.assert_allclose(infos[0]["terminal_observation"], shown[0], atol=1e-4)

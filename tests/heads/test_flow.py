@@ -119,7 +119,7 @@ def test_its_one_step_network_starts_so_too_and_leaves_the_regression_alone():
 @pytest.mark.parametrize(("flow_steps", "expected"), [(3, 3), (50, 16)])
 def test_the_one_step_network_learns_where_the_solver_of_the_settings_ends(flow_steps, expected):
     head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_steps=flow_steps, one_step_policy=True)
-    head.flow_steps = 1  # as it acts later changes nothing
+    head.options = head.options.changed(flow_steps=1)  # as it acts later changes nothing
     hidden, noise = th.randn(3, 4), th.randn(3, 2)
     error = head.one_step_action(hidden, noise) - head.solve(hidden, noise, "euler", expected).clamp(-1.0, 1.0)
     loss = head.one_step_loss(hidden, th.ones(3, dtype=th.bool), noise)

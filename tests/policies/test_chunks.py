@@ -48,9 +48,9 @@ def test_the_loss_is_that_of_the_actions_from_each_step_on(cheetah_buffer):
     policy.set_training_mode(False)
     ends = th.tensor([40, 41, 2, len(model.buffer) - 2])
     batch = model.buffer.windows(ends, 5, H - 1)
-    loss, _ = policy.compute_loss(batch)
+    loss, _ = model.compute_loss(batch)
     plain = model.buffer.windows(ends, 5)
-    hidden = policy.hidden_states(policy.network, plain._replace(actions=policy.normalization.scale_action(plain.actions)))
+    hidden = policy.network.trunk(**policy.normalization.scale_batch(plain)._asdict())
     predicted = policy.network.head(hidden).view(4, 5, H, 6)
     errors = []
     for row, end in enumerate(ends.tolist()):
@@ -103,7 +103,7 @@ def test_half_of_a_chunk_is_carried_out_unless_told_otherwise_and_it_is_saved(ch
     model.policy.set_acting(n_action_steps=5)
     model.save(tmp_path / "model")
     loaded = DTFM.load(tmp_path / "model")
-    assert (loaded.policy.chunk_size, loaded.policy.acting_settings()["n_action_steps"]) == (5, 5)
+    assert (loaded.policy.options.chunk_size, loaded.policy.acting_settings()["n_action_steps"]) == (5, 5)
     observation, _ = make_env().reset(seed=0)
     assert np.array_equal(*(each.predict(observation, deterministic=True)[0] for each in (model, loaded)))
     with pytest.raises(ValueError, match=r"n_action_steps must be a whole number in \[1, 5\], got 6"):

@@ -8,9 +8,8 @@ from gymnasium import spaces
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.files import ModelFileError
-from sb3_dtfm.policies.acting import CANDIDATE_STRIDE
 from sb3_dtfm.policies.context import Context
-from sb3_dtfm.policies.critic import Critic
+from sb3_dtfm.policies.critic import SAMPLE_STRIDE, Critic
 from tests.algorithms.small import make_model, record_curves
 
 SPACE = spaces.Box(-1.0, 1.0, (1,), np.float32)
@@ -205,11 +204,11 @@ def test_candidates_start_from_noise_as_wide_as_is_said(cheetah_buffer, sample_n
     hidden = th.randn(5, policy.network.trunk.embed_dim, generator=th.Generator().manual_seed(0))
     rows = np.arange(5)
     with th.no_grad():
-        candidates, _ = policy._draw_candidates(hidden, cheetah_buffer.observations[:5], rows, deterministic=True)
+        candidates, _ = policy._best_of_n(hidden, cheetah_buffer.observations[:5], rows, deterministic=True)
         for turn in range(4):
-            noise = policy.noise_table[th.from_numpy(rows + CANDIDATE_STRIDE * turn) % len(policy.noise_table)]
+            noise = policy.noise_table[th.from_numpy(rows + SAMPLE_STRIDE * turn) % len(policy.noise_table)]
             width = sample_noise_std if turn else 1.0  # the first is the action without a critic
-            th.testing.assert_close(candidates[:, turn], policy._decode(hidden, width * noise))
+            th.testing.assert_close(candidates[:, turn], policy.network.decode(hidden, width * noise))
     with pytest.raises(ValueError, match="sample_noise_std"):
         policy.set_acting(sample_noise_std=0.0)
 

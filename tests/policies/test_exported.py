@@ -142,7 +142,7 @@ def test_whole_episodes_are_those_of_predict(pair, lengths):
 def test_noise_that_is_given_is_started_from(pair):
     """Rows of zeros take the model's own."""
     model, path = pair
-    if not model.policy.network.head.noise_dim or model.policy.kv_cache:
+    if not model.policy.network.head.noise_dim or model.policy.options.kv_cache:
         pytest.skip("this one starts from none, or is seen above")
     exported, generator = Exported(path, 2), th.Generator().manual_seed(3)
     model.policy.seed_noise(3)
@@ -159,7 +159,7 @@ def test_the_file_says_what_a_caller_needs(pair):
     assert (settings["env_id"], settings["target_return"]) == ("HalfCheetah-v5", 5.0)
     assert (settings["action_low"], settings["action_high"]) == ([-2.0] * 6, [3.0] * 6)
     assert settings["context_length"] == model.context_length
-    assert settings["chunk_size"] == policy.chunk_size
+    assert settings["chunk_size"] == policy.options.chunk_size
     assert policy.acting_settings().items() <= settings.items()
 
 

@@ -45,7 +45,7 @@ def test_threads_with_their_own_states_act_as_alone_to_the_bit(
     model = algorithm("MultiInputPolicy", dataset=cheetah_buffer, context_length=5, policy_kwargs=policy_kwargs, seed=0)
     episodes = [episode.observations for episode in record_random_episodes(N_THREADS, seed=100)]
     expected = [roll(model, observations) for observations in episodes]
-    assert all((state[-1].size > 0) == model.policy.kv_cache for _, state in expected)
+    assert all((state[-1].size > 0) == model.policy.options.kv_cache for _, state in expected)
     barrier = Barrier(N_THREADS)
     with ThreadPoolExecutor(N_THREADS) as pool:
         together = list(pool.map(lambda observations: roll(model, observations, barrier), episodes))

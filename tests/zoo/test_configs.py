@@ -25,7 +25,7 @@ TARGETS = {
     "robosuite/Can-v0": 1,
     "robosuite/Square-v0": 1,
 }
-HEAD_KEYS = set(FlowHead.options())
+HEAD_KEYS = set(FlowHead.options_class.defaults())
 SETTINGS = [None, "paper"]
 
 
@@ -132,7 +132,7 @@ def test_a_search_can_find_the_packaged_settings(algo, settings):
         for each in (algorithm, policy)
         for name, parameter in inspect.signature(each).parameters.items()
     }
-    defaults.update(policy.head_class.options())
+    defaults.update(policy.head_class.options_class.defaults())
     for hyperparams in load(algo, settings).values():
         policy_kwargs = copy.copy(hyperparams.get("policy_kwargs", {}))
         for key in {"flow_solver", "one_step_policy", "return_scaling", "return_conditioning", "regression_coef"} & set(

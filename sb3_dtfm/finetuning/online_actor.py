@@ -8,9 +8,11 @@ from collections.abc import Callable
 from typing import Any
 
 import torch as th
+from gymnasium import spaces
 from torch import nn
 
 from sb3_dtfm.arguments import BOOLEAN, COUNT, POSITIVE, Choice, Rule, check_arguments
+from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.policies.normalization import OBSERVATION_CLIP, Normalization
 from sb3_dtfm.windows import Windows
 
@@ -43,8 +45,9 @@ def actor_observation(normalization: Normalization, newest: Windows, hidden: th.
         time step as a share of the longest episode that was learned from
     """
     scaled = normalization(newest)
+    gain = normalization.observation_gain
     parts = [
-        scaled.observations[:, 0] / normalization.observation_gain,
+        scaled.observations[:, 0] / th.where(gain > 0, gain, 1.0),  # of a constant dimension, zero
         scaled.returns_to_go,
         newest.timesteps / float(normalization.max_timestep),
     ]
@@ -93,7 +96,7 @@ class OnlineActor(nn.Module):
         self.mean = nn.Linear(widths[-1], chosen_dim)
         self.log_std = nn.Linear(widths[-1], chosen_dim)
 
-    def forward(self, observation: th.Tensor, drawn: th.Tensor) -> th.Tensor:
+    def choose(self, observation: th.Tensor, drawn: th.Tensor) -> th.Tensor:
         """
         :param observation: (B, F)
         :param drawn: (B, N), standard normal; of zeros the mean is chosen
@@ -103,20 +106,30 @@ class OnlineActor(nn.Module):
         chosen = self.mean(latent) + self.log_std(latent).clamp(*LOG_STD_RANGE).exp() * drawn
         return self.bound * chosen.tanh() if self.squashed else chosen.clamp(-self.bound, self.bound)
 
-    def act(self, observation: th.Tensor, drawn: th.Tensor, decode: Callable[[th.Tensor], th.Tensor]) -> th.Tensor:
+    def forward(
+        self,
+        normalization: Normalization,
+        newest: Windows,
+        hidden: th.Tensor,
+        drawn: th.Tensor,
+        decode: Callable[[th.Tensor], th.Tensor],
+    ) -> th.Tensor:
         """
         Noise is of the actor's distribution, a residual action its mean, and only the first action has one.
 
-        :param observation: (B, F), of :func:`actor_observation`
+        :param normalization: of the policy
+        :param newest: (B, 1, ...), in the environment's units
+        :param hidden: (B, D) of the trunk
         :param drawn: noise (B, N), standard normal
         :param decode: from noise to actions (B, H A) in [-1, 1]
         :return: (B, H A) in [-1, 1]
         """
+        observation = actor_observation(normalization, newest, hidden if self.hidden_state else None)
         if not self.residual:
-            return decode(self(observation, drawn))
+            return decode(self.choose(observation, drawn))
         actions = decode(drawn)
         own, plans = actions[:, : self.chosen_dim], actions[:, self.chosen_dim :]
-        residual = self(th.cat([observation, own], dim=1), th.zeros_like(own))
+        residual = self.choose(th.cat([observation, own], dim=1), th.zeros_like(own))
         return th.cat([(own + residual).clamp(-1.0, 1.0), plans], dim=1)
 
 
@@ -141,3 +154,29 @@ def make_online_actor(
             return OnlineActor(sees, noise_dim, **settings)
     except TypeError as error:
         raise ValueError(f"No settings of an online actor: {error}.") from error
+
+
+def check_noise_actions(policy: SequencePolicy) -> int:
+    """
+    :return: N, numbers of the noise that somebody else may choose
+    :raises ValueError: there is no flow
+    """
+    head = policy.network.head
+    if not head.noise_dim or not isinstance(policy.action_space, spaces.Box):
+        name = policy.head_class.algorithm
+        raise ValueError(f"{name} of {policy.action_space} has no flow whose noise could be chosen; a DTFM is needed.")
+    return head.noise_dim
+
+
+def check_residual_actions(policy: SequencePolicy, n_action_steps: int) -> None:
+    """
+    :param policy: to which actions are added
+    :param n_action_steps: of each plan
+    :raises ValueError: there is no flow, or it executes several actions of a chunk
+    """
+    check_noise_actions(policy)
+    if n_action_steps > 1:
+        raise ValueError(
+            f"n_action_steps={n_action_steps}: residual actions are added to single actions; "
+            "model.policy.set_acting(n_action_steps=1) carries out one of each plan."
+        )

@@ -1,0 +1,97 @@
+"""Options of the policy, which users give among `policy_kwargs`."""
+
+from dataclasses import dataclass
+
+from sb3_dtfm.arguments import (
+    BOOLEAN,
+    COUNT,
+    NOT_NEGATIVE,
+    POSITIVE,
+    PROBABILITY_BELOW_1,
+    Choice,
+    Number,
+    Options,
+    check_arguments,
+    option,
+)
+from sb3_dtfm.heads.base import NOISE_ROWS
+from sb3_dtfm.policies.normalization import OBSERVATION_SCALINGS, RETURN_SCALINGS
+
+
+@dataclass(frozen=True)
+class PolicyOptions(Options):
+    """
+    Sizes of the trunk, what it sees, and how it acts; options of the head are the head's.
+
+    :param embed_dim: width of the trunk
+    :param n_layers: number of Transformer blocks
+    :param n_heads: attention heads
+    :param dropout: dropout probability of the trunk
+    :param chunk_size: H, actions that one hidden state leads to: the newest step's and the next ones (action chunking, Zhao
+        et al., 2023; Chi et al., 2023). 1 is Decision Transformer's
+    :param n_action_steps: how many of them are carried out before the policy looks again, half of them if not given
+    :param return_conditioning: learn and act by the return-to-go; without it, the policy clones what was recorded
+    :param expected_return_steps: n: a step's return-to-go is the rewards of n steps and the return expected after such an
+        observation, so that a high target return does not stand for chance (Paster et al., 2022); 0 takes the recorded
+        one. By default 50 where returns tell how episodes act and no number makes up half of the rewards, and 0 elsewhere
+    :param return_range: with `clip_return_to_go`, keep the return-to-go also within what may be expected from such an
+        observation, see :class:`~sb3_dtfm.policies.network.ReturnRange`
+    :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step. Asking for more than
+        any episode reached, or falling behind, then stays an input like those the policy learned from
+    :param return_scaling: "timestep" or "max", see :class:`~sb3_dtfm.policies.normalization.Normalization`
+    :param film_return_to_go: let the return-to-go scale and shift what each block of the trunk gets, besides being a token
+    :param observation_scaling: "std" divides observations by their standard deviation, "robust" by the lower quartile of
+        the episodes' standard deviations, for data in which some agents' observations vary far more; see
+        :meth:`EpisodeTable.statistics`
+    :param timestep_embedding: tell the trunk the absolute time step, as Decision Transformer does
+    :param tokens_per_step: 3, return-to-go, observation and action, as Decision Transformer does; or 1, the sum of a step's
+        return-to-go, its observation and the action before it: a third of the products
+    :param critic_steps: with each gradient step, how many a critic takes, which learns what actions are worth so that the
+        best of several can be taken, see :class:`~sb3_dtfm.policies.critic.Critic`; trunk and head learn as without. It
+        needs a head that draws; 0 for no critic
+    :param gamma: discount of a step for the critic
+    :param expectile: of the critic
+    :param n_action_samples: N of best-of-N: actions, or chunks, that are sampled, of which the critic takes one; 1 asks
+        no critic
+    :param sample_noise_std: standard deviation of the noise that all but the first of them start from; above 1, which the
+        flow has learned, they differ more, and the critic has more to choose among
+    :param temperature: how much chance that choice leaves, in units of how far actions' values spread in the data; 0, the
+        default, takes the one that both values of the critic find better than the first, by the larger gain
+    :param kv_cache: act on the keys and values kept of earlier steps instead of recomputing the window: two to three times
+        faster, and equal until the window slides (see :func:`~sb3_dtfm.networks.cache.extend`)
+    :raises ValueError: an option out of range, by name
+    """
+
+    embed_dim: int = option(128, COUNT)
+    n_layers: int = option(3, COUNT)
+    n_heads: int = option(2, COUNT)
+    dropout: float = option(0.0, PROBABILITY_BELOW_1)
+    chunk_size: int = option(1, COUNT)
+    n_action_steps: int = option(None, COUNT._replace(optional=True), acting=True)
+    return_conditioning: bool = option(True, BOOLEAN)
+    expected_return_steps: int = option(0, Number(low=0, whole=True))
+    return_range: bool = option(True, BOOLEAN)
+    clip_return_to_go: bool = option(True, BOOLEAN)
+    return_scaling: str = option("timestep", Choice(RETURN_SCALINGS))
+    film_return_to_go: bool = option(True, BOOLEAN)
+    observation_scaling: str = option("std", Choice(OBSERVATION_SCALINGS))
+    timestep_embedding: bool = option(False, BOOLEAN)
+    tokens_per_step: int = option(1, Choice((1, 3)))
+    critic_steps: int = option(0, Number(low=0, whole=True))
+    gamma: float = option(0.99, PROBABILITY_BELOW_1)
+    expectile: float = option(0.7, Number(low=0.5, high=1, below_high=True))
+    n_action_samples: int = option(1, Number(low=1, high=NOISE_ROWS, whole=True), acting=True)
+    sample_noise_std: float = option(1.0, POSITIVE, acting=True)
+    temperature: float = option(0.0, NOT_NEGATIVE, acting=True)
+    kv_cache: bool = option(False, BOOLEAN, acting=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        n_action_steps = (self.chunk_size + 1) // 2 if self.n_action_steps is None else self.n_action_steps
+        accepted = {"n_action_steps": Number(low=1, high=self.chunk_size, whole=True)}
+        vars(self).update(check_arguments({"n_action_steps": n_action_steps}, accepted))
+        if self.n_action_samples > 1 and not self.critic_steps:
+            raise ValueError(
+                f"n_action_samples={self.n_action_samples} needs a model that was trained with "
+                "policy_kwargs=dict(critic_steps=...)."
+            )
