@@ -4,6 +4,7 @@ Sizes that this project keeps, printed by `make lint`, which fails where one is 
 A word is what has a letter or a digit between two spaces; lines of code blocks and tables do not count as prose.
 """
 
+import ast
 import re
 import subprocess
 import sys
@@ -14,6 +15,19 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[1]
 # Written by a tool, or tables that a test compares with the results.
 GENERATED = ("licences.md", "report.md")
+# What a reader needs to see how recorded steps become a loss; tests/test_training_path.py watches that nothing is missing.
+TRAINING_PATH = (
+    "algorithms/offline.py",
+    "data/drawing.py",
+    "windows.py",
+    "policies/normalization.py",
+    "policies/network.py",
+    "networks/trunk.py",
+    "networks/layers.py",
+    "heads/base.py",
+    "heads/flow.py",
+    "heads/regression.py",
+)
 # The commit after which subjects follow CONTRIBUTING.
 SUBJECTS_SINCE = "3a8e903826f089cfad7d3867de6233aee4cf4262"
 # Words that begin no imperative.
@@ -46,6 +60,14 @@ def n_lines(path: str) -> int:
     return len((ROOT / path).read_text().splitlines())
 
 
+def n_arguments(path: str, name: str) -> int:
+    """Arguments that a class's constructor shows to its users."""
+    found = (node for node in ast.walk(ast.parse((ROOT / path).read_text())) if isinstance(node, ast.ClassDef))
+    (own,) = (each for node in found if node.name == name for each in node.body if getattr(each, "name", "") == "__init__")
+    assert isinstance(own, ast.FunctionDef)
+    return sum(not each.arg.startswith("_") and each.arg != "self" for each in own.args.args)
+
+
 def subjects() -> list[str]:
     """Of the commits since the rule began; none in a copy without a history."""
     command = ["git", "-C", str(ROOT), "log", "--no-merges", "--format=%s", f"{SUBJECTS_SINCE}..HEAD"]
@@ -62,6 +84,10 @@ def sizes() -> Iterator[Size]:
     for page in pages:
         if page.parent.name == "studies":
             yield Size(f"words of prose in studies/{page.name}", words(page.read_text(), prose=True), 700)
+    yield Size("lines from recorded steps to the loss", sum(n_lines(f"sb3_dtfm/{path}") for path in TRAINING_PATH), 2000)
+    yield Size("files from recorded steps to the loss", len(TRAINING_PATH), 10)
+    constructor = n_arguments("sb3_dtfm/algorithms/offline.py", "OfflineAlgorithm")
+    yield Size("arguments of an algorithm's constructor", constructor, 20)
     yield Size("files in results", len(results), 60)
     yield Size("MB of results", sum(path.stat().st_size for path in results) / 1e6, 3.0)
     if found := subjects():

@@ -36,9 +36,14 @@ class Number(NamedTuple):
         if value is None:
             return self.optional
         kind = numbers.Integral if self.whole else numbers.Real
-        if type(value) is bool or not isinstance(value, kind) or not math.isfinite(value):
+        if type(value) is bool or not isinstance(value, kind):
             return False
-        number = float(value)
+        try:
+            number = float(value)
+        except OverflowError:  # 10**400
+            return False
+        if not math.isfinite(number):
+            return False
         at_least = number > self.low if self.above_low else number >= self.low
         return at_least and (number < self.high if self.below_high else number <= self.high)
 

@@ -2,11 +2,20 @@
 
 import time
 import warnings
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import torch as th
 from stable_baselines3.common import logger
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EventCallback, ProgressBarCallback
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    ConvertCallback,
+    EvalCallback,
+    EventCallback,
+    ProgressBarCallback,
+)
+from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_dtfm.data.trajectories import ScoreReference
 
@@ -30,6 +39,26 @@ def find_eval_callbacks(callback: BaseCallback | None) -> list[EvalCallback]:
     if isinstance(callback, EventCallback):
         return find_eval_callbacks(callback.callback)
     return []
+
+
+def combine_callbacks(
+    callback: MaybeCallback, score_reference: ScoreReference | None, own: Iterable[BaseCallback]
+) -> tuple[CallbackList, list[EvalCallback]]:
+    """
+    A user's callbacks with those of the learn loop.
+
+    :param callback: as SB3's `learn` takes it
+    :param score_reference: scale of the normalised score, which is logged where there is one
+    :param own: behind the user's
+    :return: all of them, and those that evaluate
+    """
+    if isinstance(callback, list):
+        callback = CallbackList(callback)
+    evaluations = find_eval_callbacks(callback) if isinstance(callback, BaseCallback) else []
+    children = [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
+    if score_reference is not None:
+        children.append(NormalizedScoreCallback(score_reference, evaluations))
+    return CallbackList([*children, *own]), evaluations
 
 
 class GradientStepProgressBar(ProgressBarCallback):

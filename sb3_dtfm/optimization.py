@@ -4,8 +4,9 @@ import contextlib
 import functools
 import math
 import os
+import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch as th
@@ -14,6 +15,8 @@ from torch.nn import functional as F
 
 LEARNING_RATE_SCHEDULES = ("constant", "linear", "cosine")
 PRECISIONS = ("auto", "float32", "bfloat16")
+# Logged numbers that have to be finite.
+FINITE = ("loss", "grad_norm", "critic_loss")
 # Rows and repetitions that decide which of them is faster on a CPU.
 TIMED_ROWS, N_TIMES = 512, 5
 # Multiplications of a gradient step up to which one thread is as quick as two, which wait for one another.
@@ -44,7 +47,7 @@ def multiplies_bfloat16(device: th.device) -> bool:
     return th.cpu._is_avx512_bf16_supported() or th.cpu._is_amx_tile_supported()
 
 
-def choose_precision(network: nn.Module, n_rows: int, device: th.device) -> tuple[str, str]:
+def choose_precision(network: nn.Module, n_rows: int, device: th.device, n_processes: int = 1) -> tuple[str, str]:
     """
     What the precision "auto" is, and why: bfloat16 where the hardware multiplies in it, on a CPU only if that is faster than
     float32 for the network's own products, which are timed once for each process.
@@ -52,8 +55,11 @@ def choose_precision(network: nn.Module, n_rows: int, device: th.device) -> tupl
     :param network: its linear layers count
     :param n_rows: rows that a gradient step multiplies by a weight
     :param device: where training runs
+    :param n_processes: that train together, and would each measure for themselves
     :return: "float32" or "bfloat16", and a sentence
     """
+    if device.type == "cpu" and n_processes > 1:
+        return "float32", "Matrix products are in float32: each of several processes would measure for itself."
     if not multiplies_bfloat16(device):
         return "float32", f"Matrix products are in float32: this {device.type} has no instructions for bfloat16."
     if device.type == "cuda":
@@ -115,6 +121,53 @@ def limit_threads(n_macs: float) -> Iterator[None]:
         yield
     finally:
         th.set_num_threads(n_threads)
+
+
+@functools.cache
+def total_memory(device: th.device) -> int:
+    """Bytes of memory that a device has, free or not."""
+    if device.type == "cuda":
+        return int(th.cuda.get_device_properties(device).total_memory)
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2**63
+
+
+@contextlib.contextmanager
+def explain_out_of_memory(device: th.device, sizes: str, n_bytes: int = 0) -> Iterator[None]:
+    """
+    :param device: where training runs
+    :param sizes: the settings that decide how much is needed
+    :param n_bytes: a batch alone takes; more than the device has are refused before an operating system ends the process
+    :raises MemoryError: in place of any error of memory, with these settings
+    """
+    if n_bytes > (there := total_memory(device)):
+        raise MemoryError(
+            f"A batch alone takes {n_bytes / 1e9:,.1f} GB, and {device} has {there / 1e9:,.1f}: {sizes}. Lower batch_size first."
+        )
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        # On a CPU torch has no class for it.
+        if isinstance(error, RuntimeError) and not re.search("out of memory|(allocate|enough) memory", str(error), re.I):
+            raise
+        raise MemoryError(
+            f"A gradient step does not fit into the memory of {device}: {sizes}. Lower batch_size first."
+        ) from error
+
+
+def check_finite(means: dict[str, float], where: Callable[[], str], last_saved: str | None) -> None:
+    """
+    :param means: of what is logged, by name
+    :param where: names the gradient steps
+    :param last_saved: the last checkpoint
+    :raises FloatingPointError: one of `FINITE` is not finite
+    """
+    for name in FINITE:
+        if not math.isfinite(means.get(name, 0.0)):
+            raise FloatingPointError(
+                f"The {name} became {means[name]} {where()}. Such steps change no weight, so the last checkpoint is good: "
+                f"{last_saved or 'none was saved since this model was made or loaded'}. Try a lower learning_rate, "
+                "warmup_steps or max_grad_norm."
+            )
 
 
 class RunningMeans:

@@ -30,7 +30,7 @@ N_FIRST_STEPS = 40
 
 
 def split(buffer: TrajectoryBuffer, fraction: float, seed: int) -> dict[str, TrajectoryBuffer]:
-    """The episodes that `dataset_fraction` and `dataset_seed` choose, and those that they leave out."""
+    """The episodes that `fraction` and `fraction_seed` choose, and those that they leave out."""
     learned = buffer.random_fraction(fraction, seed)
     others = np.flatnonzero(~np.isin(buffer.episodes.starts, learned.episodes.starts))
     return {"learned": learned} | ({"held out": buffer.select(others)} if len(others) else {})

@@ -26,7 +26,7 @@ from sb3_dtfm.files import replacing
 N_ENVS = 10
 N_FINAL_EPISODES = 100
 SETTINGS = dict(gradient_steps=-1, learning_starts=1000)
-OF_THE_DATA = ("dataset", "dataset_fraction", "dataset_seed", "dataset_kwargs")
+OF_THE_DATA = ("dataset", "dataset_kwargs")
 
 
 def fill(replay: ReplayBuffer, recorded: TrajectoryBuffer, agent: SAC) -> int:
@@ -74,8 +74,7 @@ def main() -> None:
     agent = SAC("MlpPolicy", envs, seed=like["seed"], device="cpu", **SETTINGS)
     if options.with_data:
         recorded = load_dataset(of_the_data["dataset"], **of_the_data.get("dataset_kwargs", {}))
-        share = (of_the_data.get("dataset_fraction", 1.0), of_the_data.get("dataset_seed", 0))
-        print(f"{fill(agent.replay_buffer, recorded.random_fraction(*share), agent)} recorded steps in the replay buffer")
+        print(f"{fill(agent.replay_buffer, recorded, agent)} recorded steps in the replay buffer")
     row = {
         **{key: like[key] for key in ("task", "regime", "seed", "profile", "data")},
         "algo": "sac",

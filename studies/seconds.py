@@ -85,8 +85,7 @@ class Cell:
         """The episodes, as `train` reads them."""
         settings, task = self.job.settings, known_task(self.vec_env)
         known = {"action_space": self.vec_env.action_space, "max_episode_steps": task and task.max_episode_steps}
-        buffer = load_dataset(settings["dataset"], **{**known, **(settings.get("dataset_kwargs") or {})})
-        return buffer.random_fraction(settings["dataset_fraction"], settings["dataset_seed"])
+        return load_dataset(settings["dataset"], **{**known, **(settings.get("dataset_kwargs") or {})})
 
     def evaluate(self, model: Any, step: int, seconds: float, **more: Any) -> bool:
         """
@@ -156,7 +155,7 @@ def run_here(job: Job) -> Cell:
             model = Cloning(buffer, settings["hidden_sizes"], settings["learning_rate"], job.cell.seed)
             model.learn(n_steps, settings["batch_size"], callback)
         else:
-            apart = {"policy", "n_timesteps", "dataset", "dataset_kwargs", "dataset_fraction", "dataset_seed"}
+            apart = {"policy", "n_timesteps", "dataset", "dataset_kwargs"}
             own = {key: value for key, value in settings.items() if key not in {*apart, "env_wrapper", "env_kwargs"}}
             learner = ALGORITHMS[algo](
                 settings["policy"], cell.vec_env, dataset=cell.buffer(), seed=job.cell.seed, device="cpu", **own

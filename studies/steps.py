@@ -25,7 +25,7 @@ import torch as th
 from gymnasium import spaces
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from sb3_dtfm.algorithms import ALGORITHMS, OfflineSequenceAlgorithm
+from sb3_dtfm.algorithms import ALGORITHMS, OfflineAlgorithm
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.zoo.registration import policy_of
 
@@ -117,7 +117,7 @@ class Products(TorchDispatchMode):
         return 1e3 * statistics.median(times)
 
 
-def make_model(name: str, precision: str = "float32") -> OfflineSequenceAlgorithm:
+def make_model(name: str, precision: str = "float32") -> OfflineAlgorithm:
     """A model of random data with nothing left to decide."""
     step = STEPS[name]
     rng = np.random.default_rng(0)
@@ -128,10 +128,12 @@ def make_model(name: str, precision: str = "float32") -> OfflineSequenceAlgorith
     dataset = TrajectoryBuffer.from_trajectories(episodes, spaces.Box(-1, 1, (step.action_dim,)))
     known = policy_of(step.algo).parameter_names()
     decided = {key: value for key, value in CONDITIONED.items() if key in known}
+    if decided:
+        decided["expected_return_steps"] = 0
     given = dict(batch_size=step.batch_size, context_length=step.context_length, return_weighting=0.0, ema_decay=0.999)
     return ALGORITHMS[step.algo](
         "MultiInputPolicy", dataset=dataset, policy_kwargs={**decided, **step.policy_kwargs}, precision=precision,
-        expected_return_steps=0 if decided else None, device="cpu", seed=0, **given,
+        device="cpu", seed=0, **given,
     )  # fmt: skip
 
 

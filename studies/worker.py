@@ -22,7 +22,7 @@ import torch as th
 from gymnasium import spaces
 
 import sb3_dtfm
-from sb3_dtfm.algorithms import ALGORITHMS, OfflineSequenceAlgorithm
+from sb3_dtfm.algorithms import ALGORITHMS, OfflineAlgorithm
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 
 OBSERVATION_DIM, ACTION_DIM, BATCH_SIZE, CONTEXT_LENGTH = 17, 6, 64, 20
@@ -38,7 +38,7 @@ def make_model(
     context_length: int = CONTEXT_LENGTH,
     precision: str = "auto",
     **policy_kwargs: object,
-) -> OfflineSequenceAlgorithm:
+) -> OfflineAlgorithm:
     """DT or DTFM at its defaults but for the size and what is given."""
     rng = np.random.default_rng(0)
     episodes = [
@@ -60,7 +60,7 @@ def make_model(
     )
 
 
-def train(model: OfflineSequenceAlgorithm, n_steps: int) -> dict[str, float]:
+def train(model: OfflineAlgorithm, n_steps: int) -> dict[str, float]:
     """Median of the time between two steps of `learn`, its sampling included, and the time of the sampling."""
     stamps = []
     model.learn(
@@ -74,7 +74,7 @@ def train(model: OfflineSequenceAlgorithm, n_steps: int) -> dict[str, float]:
     return {"wall_ms": wall, "processor_ms": processor, "sampling_ms": sampling}
 
 
-def act(model: OfflineSequenceAlgorithm, n: int, n_envs: int, first: int) -> dict[str, float]:
+def act(model: OfflineAlgorithm, n: int, n_envs: int, first: int) -> dict[str, float]:
     """Median time of `predict` with a full context, in episodes seen from time step `first` on."""
     rng = np.random.default_rng(0)
     state, times = None, []

@@ -24,6 +24,7 @@ TINY_POLICY = dict(
     film_return_to_go=False,
     observation_scaling="std",
     return_conditioning=True,
+    expected_return_steps=0,
 )
 TINY_FLOW_POLICY = dict(
     TINY_POLICY,
@@ -42,7 +43,6 @@ PLAIN = dict(
     warmup_steps=0,
     ema_decay=0.0,
     return_weighting=0.0,
-    expected_return_steps=0,
 )
 EPISODE_LENGTH = 30
 

@@ -12,6 +12,7 @@ from tests.data.corpus import write_lerobot
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = "sb3_dtfm"
+SOURCES = sorted((ROOT / PACKAGE).rglob("*.py"))
 
 # Part: its files, and the parts of the package that it may import.
 PARTS = {
@@ -116,6 +117,16 @@ def test_rooms_form_no_circle():
     while free := {part for part in below if part not in ordered and below[part] <= ordered}:
         ordered |= free
     assert ordered == set(PARTS), f"a circle among {sorted(set(PARTS) - ordered)}"
+
+
+def test_modules_form_no_circle_not_even_for_types():
+    """Imports for type checkers alone count: a reader follows them, too."""
+    modules = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in SOURCES}
+    below = {name: {each for each in imported_modules(path) if each in modules} for name, path in modules.items()}
+    ordered: set[str] = set()
+    while free := {name for name in below if name not in ordered and below[name] <= ordered}:
+        ordered |= free
+    assert ordered == set(modules), f"a circle among {sorted(set(modules) - ordered)}"
 
 
 def test_networks_need_torch_and_numpy_alone():

@@ -4,12 +4,12 @@ from typing import ClassVar
 
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_dtfm.algorithms.base import POLICY_NAMES
-from sb3_dtfm.algorithms.offline import OfflineSequenceAlgorithm
+from sb3_dtfm.algorithms.model import POLICY_NAMES
+from sb3_dtfm.algorithms.offline import OfflineAlgorithm
 from sb3_dtfm.policies import DTFMPolicy
 
 
-class DTFM(OfflineSequenceAlgorithm):
+class DTFM(OfflineAlgorithm):
     """
     Decision Transformer with flow matching: the trunk's hidden state conditions a vector field from noise to action.
     """

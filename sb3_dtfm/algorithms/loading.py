@@ -1,43 +1,56 @@
-"""A model from its file, and the checks that what is in there passes before it is one."""
+"""What a model's file says, as plain data, each checked before it is used."""
 
 import contextlib
 import io
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, NamedTuple
 
 import torch as th
 from gymnasium import spaces
 from minari.serialization import deserialize_space
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.utils import LinearSchedule, get_device
+from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_dtfm.algorithms.saving import ENCODED, OPTIMIZER, POLICY, SPACES, UnsavedSchedule, head_name, optimizers
-from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, Number, Rule, check_arguments
+from sb3_dtfm.algorithms.saving import (
+    ENCODED,
+    NEVER_SAVED,
+    OPTIMIZER,
+    POLICY,
+    SPACES,
+    UnsavedSchedule,
+    head_name,
+    optimizers,
+)
+from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, Choice, Number, Rule, check_arguments
 from sb3_dtfm.data import ReturnReference, check_action_space
 from sb3_dtfm.envs import OBSERVATION, RETURN_TO_GO, TIMESTEP
 from sb3_dtfm.files import ModelFileError, file_name, read_model
 from sb3_dtfm.optimization import RunningMeans
 from sb3_dtfm.policies import SequencePolicy
 
-if TYPE_CHECKING:
-    from sb3_dtfm.algorithms.base import OfflineAlgorithm
-
-SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineAlgorithm")
-
-WHOLE = Number(low=0, whole=True)
-# What the file says of a model beside its arguments, which are checked as when they are given.
-COUNTERS: dict[str, Rule] = {
+WHOLE = Number(low=0, high=2**63, whole=True)
+# Attributes of a model beside its arguments, which are checked as when they are given.
+SAVED: dict[str, Rule] = {
     "num_timesteps": WHOLE,
     "_total_timesteps": WHOLE,
     "_num_timesteps_at_start": WHOLE,
     "_n_updates": WHOLE,
-    "n_envs": COUNT,
+    "_episode_num": WHOLE,
+    "_n_left": WHOLE,
+    "n_episodes": COUNT,
+    "gradient_steps": COUNT,
+    "start_time": NOT_NEGATIVE,
+    "n_envs": Number(low=1, high=2**16, whole=True),
     "max_timestep": COUNT,
     "time_limit": COUNT._replace(optional=True),
-    "_n_left": WHOLE,
-    "verbose": WHOLE,
+    "verbose": Choice((0, 1, 2)),
+    "use_sde": Choice((False,)),
+    "sde_sample_freq": Choice((-1,)),
+    "_stats_window_size": Number(low=1, high=2**20, whole=True),
+    "_current_progress_remaining": Number(low=0, high=1),
+    "_current_learning_rate": NOT_NEGATIVE,
+    "_training_seed": Number(low=0, high=2**64, below_high=True, whole=True, optional=True),
 }
 # Values of a ReturnReference, in its order.
 RETURN_REFERENCE: tuple[Rule, ...] = (
@@ -47,7 +60,6 @@ RETURN_REFERENCE: tuple[Rule, ...] = (
 # Of the policy's tensors.
 POSITIVE_BUFFERS = {
     "normalization.observation_std",
-    "normalization.observation_gain",
     "normalization.return_scale",
     "normalization.return_std",
     "critic.reward_scale",
@@ -55,6 +67,18 @@ POSITIVE_BUFFERS = {
 }
 # The optimiser's state of a weight: its own shape, or a number.
 MOMENTS = {"step": False, "exp_avg": True, "exp_avg_sq": True}
+
+
+class SavedModel(NamedTuple):
+    """
+    :param attributes: of the model, by name
+    :param tensors: of policy and optimiser, by name
+    :param source: the file, for messages
+    """
+
+    attributes: dict[str, Any]
+    tensors: dict[str, dict[str, th.Tensor]]
+    source: str
 
 
 @contextlib.contextmanager
@@ -68,75 +92,13 @@ def wrap_file_errors(source: str) -> Iterator[None]:
         yield
     except ModelFileError:
         raise
-    except (TypeError, ValueError, AttributeError, RuntimeError) as error:
+    except (TypeError, ValueError, AttributeError, RuntimeError, OverflowError) as error:
         raise ModelFileError(f"{source}: {error}") from error
-
-
-def from_file(
-    algorithm: type[SelfAlgorithm],
-    path: str | Path | io.BufferedIOBase,
-    device: th.device | str,
-    custom_objects: dict[str, Any],
-    print_system_info: bool,
-    changed: dict[str, Any],
-) -> SelfAlgorithm:
-    """
-    A model of what a file says.
-
-    :param algorithm: the class that is loaded
-    :param path: the file
-    :param device: of the model
-    :param custom_objects: attributes in place of those in the file
-    :param print_system_info: print what the file was saved with
-    :param changed: attributes that are others from now on
-    :raises ModelFileError: the file is damaged, pickled, of another algorithm, or holds what no model can have
-    :raises ValueError: a changed attribute out of range
-    """
-    source = file_name(path)
-    configuration, tensors = read_model(path, {POLICY, OPTIMIZER}, get_device(device), print_system_info)
-    attributes = from_configuration(algorithm, configuration, custom_objects, source)
-    if changed.get("policy_kwargs", attributes.get("policy_kwargs")) != attributes.get("policy_kwargs"):
-        raise ValueError(
-            f"policy_kwargs are what the weights of {source} were made with, {attributes.get('policy_kwargs')}, and "
-            f"cannot be changed: got {changed['policy_kwargs']}."
-        )
-    model = algorithm(attributes["policy_class"], device=device, _init_setup_model=False)
-    if attributes.get("online_actor") is not None and not hasattr(model, "online_actor"):
-        raise ModelFileError(
-            f"{source} is a fine-tuned DTFM: sb3_dtfm.finetuning.FinetunedDTFM loads it. To go on learning, `sb3-dtfm "
-            "finetune -i` takes the agent.zip beside it, and --model the DTFM that it began with."
-        )
-    vars(model).update(attributes)
-    with wrap_file_errors(source):
-        check_sizes(model, tensors[POLICY], source)
-    vars(model).update(changed)
-    model._setup_model()
-    with wrap_file_errors(source):
-        model.set_parameters(parameters(model.policy, tensors, source), device=device)
-    return model
-
-
-def check_sizes(model: "OfflineAlgorithm", tensors: dict[str, th.Tensor], source: str) -> None:
-    """
-    See :func:`check_policy`.
-
-    :param model: with the attributes of the file
-    :param tensors: the policy's
-    :param source: the file, for messages
-    :raises ModelFileError: more layers than there are tensors, or others than these settings make
-    """
-    model._check_arguments(learning_rate=NOT_NEGATIVE)
-    for name, value in (model.policy_kwargs or {}).items():
-        if name.endswith("n_layers") and isinstance(value, int) and value > len(tensors):
-            raise ModelFileError(f"{source}: policy_kwargs say {name}={value}, and there are {len(tensors)} tensors.")
-    model._setup_lr_schedule()
-    with th.device("meta"):
-        check_policy(model._make_policy(ema=False), tensors, source)
 
 
 def parameters(policy: SequencePolicy, tensors: dict[str, dict[str, th.Tensor]], source: str) -> dict[str, Any]:
     """
-    What :meth:`OfflineAlgorithm.set_parameters` takes, from the tensors of a file.
+    What an algorithm's `set_parameters` takes, from the tensors of a file.
 
     :raises ModelFileError: see :func:`optimizer_state`
     """
@@ -148,54 +110,64 @@ def parameters(policy: SequencePolicy, tensors: dict[str, dict[str, th.Tensor]],
     return loaded
 
 
-def from_configuration(
-    algorithm: type[BaseAlgorithm], configuration: Mapping[str, Any], custom_objects: Mapping[str, Any], source: str
-) -> dict[str, Any]:
+def read_saved(
+    path: str | Path | io.BufferedIOBase,
+    policies: Mapping[str, type[BasePolicy]],
+    custom_objects: Mapping[str, Any],
+    device: th.device,
+    print_system_info: bool,
+) -> SavedModel:
     """
-    The attributes of a model from JSON.
+    What a file says of a model: plain data, each checked by its own rule.
 
-    :param algorithm: the class that is loaded
-    :param configuration: of :func:`~sb3_dtfm.algorithms.saving.to_configuration`
+    :param path: the file
+    :param policies: the algorithm's, by alias
     :param custom_objects: attributes in place of those in the file
-    :param source: the file, for messages
-    :raises ModelFileError: something is missing, or not what that writes
+    :param device: of the tensors
+    :param print_system_info: print what the file was saved with
+    :raises ModelFileError: something is missing, of another algorithm, or not what a model was saved with
     """
+    source = file_name(path)
+    configuration, tensors = read_model(path, {POLICY, OPTIMIZER}, device, print_system_info)
 
     def taken(name: str, kinds: type | tuple[type, ...]) -> Any:
         if not isinstance(configuration.get(name), kinds):
             raise ModelFileError(f"{source}: {name} is {configuration.get(name)!r}, which no model was saved with.")
         return configuration[name]
 
-    saved_by, asked = taken("algorithm", str), head_name(algorithm)
+    saved_by, asked = taken("algorithm", str), head_name(policies)
     if saved_by != asked:
-        raise ModelFileError(f"{source} was saved by {saved_by}, not by {asked}.")
+        raise ModelFileError(f"{source} was saved by {saved_by!r}, not by {asked}.")
     attributes = dict(taken("attributes", dict))
-    for name in attributes:
-        if hasattr(algorithm, name) or name in (*ENCODED, "policy", "device", "env"):
-            raise ModelFileError(f"{source}: {name} is no attribute that a model is saved with.")
+    for name in ENCODED & attributes.keys():
+        raise ModelFileError(f"{source}: {name} is no attribute that a model is saved with.")
     attributes.update({name: _space(taken(name, str), f"{source}: {name}") for name in SPACES})
     attributes["_means"] = _to_means(taken("means", dict), source)
     attributes["learning_rate"] = _to_learning_rate(taken("learning_rate", (int, float, str, dict)), source)
     if "policy_class" not in custom_objects:
-        attributes["policy_class"] = _policy_class(algorithm, taken("policy_class", str), source)
+        attributes["policy_class"] = _policy_class(policies, taken("policy_class", str), source)
     attributes.update({name: each for name, each in custom_objects.items() if name in {*attributes, *ENCODED}})
     _check_attributes(attributes, source)
-    return attributes
+    return SavedModel(attributes, tensors, source)
 
 
-def _policy_class(algorithm: type[BaseAlgorithm], name: str, source: str) -> type[BasePolicy]:
-    if name not in algorithm.policy_aliases:
+def _policy_class(policies: Mapping[str, type[BasePolicy]], name: str, source: str) -> type[BasePolicy]:
+    if name not in policies:
         raise ModelFileError(
             f"{source}: its policy is a {name}, a class that a file does not hold; "
             f"give it, load(path, custom_objects={{'policy_class': {name}}})."
         )
-    return algorithm.policy_aliases[name]
+    return policies[name]
 
 
 def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
     """What is not checked as arguments are."""
     if not isinstance(attributes.get("policy_kwargs", {}), dict):
         raise ModelFileError(f"{source}: policy_kwargs are {attributes['policy_kwargs']!r}, expected arguments by name.")
+    dataset_kwargs = attributes.get("dataset_kwargs") or {}
+    if not isinstance(dataset_kwargs, dict) or set(NEVER_SAVED) & set(dataset_kwargs):
+        accepted = f"arguments by name, without {' and '.join(NEVER_SAVED)}"
+        raise ModelFileError(f"{source}: dataset_kwargs are {dataset_kwargs!r}, expected {accepted}.")
     reference = attributes.get("score_reference")
     kinds = [type(each) for each in reference] if isinstance(reference, list) else reference
     if kinds not in (None, [float, float, str]) or (reference and not reference[0] < reference[1]):
@@ -206,7 +178,7 @@ def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
     if returns is not None and not accepted:
         raise ModelFileError(f"{source}: return_reference is {returns}, expected {', '.join(ReturnReference._fields)}.")
     with wrap_file_errors(source):
-        check_arguments({**dict.fromkeys(COUNTERS, 1), **attributes}, COUNTERS)  # one may have been left out
+        check_arguments(attributes, {name: rule for name, rule in SAVED.items() if name in attributes})
     observation, action = attributes["observation_space"], attributes["action_space"]
     parts = observation.spaces if isinstance(observation, spaces.Dict) else {}
     is_vector = {name: isinstance(part, spaces.Box) and len(part.shape) == 1 for name, part in parts.items()}
@@ -227,11 +199,13 @@ def _to_learning_rate(saved: Any, source: str) -> Any:
     if isinstance(saved, str):
         return UnsavedSchedule(saved)
     if not isinstance(saved, dict):
+        if not NOT_NEGATIVE.accepts(saved):
+            raise ModelFileError(f"{source}: learning_rate must be {NOT_NEGATIVE}, got {saved!r:.40}.")
         return float(saved)
-    try:
-        return LinearSchedule(**{name: float(value) for name, value in saved.items()})
-    except (TypeError, ValueError) as error:
-        raise ModelFileError(f"{source}: learning_rate is {saved}, expected start, end and end_fraction.") from error
+    accepted = {"start": NOT_NEGATIVE, "end": NOT_NEGATIVE, "end_fraction": Number(low=0, high=1, above_low=True)}
+    if saved.keys() != accepted.keys() or not all(rule.accepts(saved[name]) for name, rule in accepted.items()):
+        raise ModelFileError(f"{source}: learning_rate is {saved}, expected start, end and end_fraction.")
+    return LinearSchedule(**{name: float(value) for name, value in saved.items()})
 
 
 def _to_means(saved: dict[str, Any], source: str) -> RunningMeans:
@@ -302,5 +276,7 @@ def check_policy(policy: SequencePolicy, tensors: Mapping[str, th.Tensor], sourc
     for name in POSITIVE_BUFFERS & tensors.keys():
         if not bool((tensors[name] > 0).all()):
             raise ModelFileError(f"{source}: {POLICY} {name} must be positive.")
+    if bool((tensors["normalization.observation_gain"] < 0).any()):
+        raise ModelFileError(f"{source}: {POLICY} normalization.observation_gain must not be negative.")
     if unlimited in tensors and not bool((tensors[unlimited][0] <= tensors[unlimited][1]).all()):
         raise ModelFileError(f"{source}: {POLICY} {unlimited}: the smallest must not be above the largest.")

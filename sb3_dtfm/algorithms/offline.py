@@ -1,66 +1,307 @@
-"""The offline learn loop."""
+"""Offline learning from recorded episodes: one class, whose children differ in their policy's head."""
 
-import contextlib
 import itertools
 import math
-import re
 import time
 from collections.abc import Callable, Iterator
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback, ProgressBarCallback
-from stable_baselines3.common.type_aliases import MaybeCallback
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import configure_logger, update_learning_rate
 
-from sb3_dtfm.algorithms.base import OfflineAlgorithm
-from sb3_dtfm.arguments import POSITIVE
-from sb3_dtfm.callbacks import GradientStepProgressBar, NormalizedScoreCallback, TimeLeft, find_eval_callbacks
-from sb3_dtfm.data import TrajectoryBuffer
-from sb3_dtfm.data.decisions import sentences
-from sb3_dtfm.distributed import DataParallel, LossFunction, is_first_process, n_processes
-from sb3_dtfm.envs import check_vec_env, share_target_return
+from sb3_dtfm.actions import ActionSpace
+from sb3_dtfm.algorithms.model import SequenceModel
+from sb3_dtfm.algorithms.saving import UnsavedSchedule
+from sb3_dtfm.arguments import (
+    BOOLEAN,
+    COUNT,
+    NOT_NEGATIVE,
+    POSITIVE,
+    PROBABILITY_BELOW_1,
+    Choice,
+    Number,
+    Rule,
+    check_arguments,
+)
+from sb3_dtfm.callbacks import GradientStepProgressBar, TimeLeft, combine_callbacks
+from sb3_dtfm.data import (
+    Dataset,
+    ReturnReference,
+    ScoreReference,
+    TrajectoryBuffer,
+    load_dataset,
+)
+from sb3_dtfm.data.decisions import Decision, decide_open, sentences
+from sb3_dtfm.data.inspection import return_reference, suggested_target_return
+from sb3_dtfm.distributed import (
+    DataParallel,
+    LossFunction,
+    check_batch_size,
+    is_first_process,
+    local_rank_zero_first,
+    n_processes,
+)
+from sb3_dtfm.envs import check_vec_env, known_task, return_to_go_space, share_target_return
 from sb3_dtfm.optimization import (
     BATCHES,
     DROPOUT,
+    FINITE,
+    LEARNING_RATE_SCHEDULES,
     NOISE,
+    PRECISIONS,
     TRANSITIONS,
     RunningMeans,
     autocast,
+    check_finite,
     choose_precision,
+    explain_out_of_memory,
     learning_rate_factor,
     limit_threads,
     seed_default_generator,
     step_seed,
 )
+from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.windows import Transitions, Windows
 
-SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineSequenceAlgorithm")
+SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineAlgorithm")
 
-# What has to be finite of what is logged.
-FINITE = ("loss", "grad_norm", "critic_loss")
+ACCEPTED: dict[str, Rule] = {
+    "batch_size": COUNT._replace(optional=True),
+    "weight_decay": NOT_NEGATIVE,
+    "context_length": Number(low=1, high=100_000, whole=True),
+    "return_weighting": NOT_NEGATIVE._replace(optional=True),
+    "max_grad_norm": NOT_NEGATIVE._replace(optional=True),
+    "warmup_steps": Number(low=0, whole=True),
+    "learning_rate_schedule": Choice(LEARNING_RATE_SCHEDULES),
+    "ema_decay": PROBABILITY_BELOW_1,
+    "precision": Choice(PRECISIONS),
+    "compile": Choice((None, *BOOLEAN.values)),
+    "seed": Number(low=0, whole=True, optional=True),
+    "target_return": Number(optional=True),
+}
+# Arguments of the algorithm that the data decide where they are None; the policy's are among `policy_kwargs`.
+DECIDED = {"batch_size", "return_weighting"}
 # Episodes that a message shows at most.
 N_EPISODES_SHOWN = 50
 
 
-class OfflineSequenceAlgorithm(OfflineAlgorithm):
+class OfflineAlgorithm(SequenceModel):
     """
     Learn a sequence policy from recorded episodes: `learn(total_timesteps)` counts gradient steps.
 
     Where `torch.distributed` is initialised, its processes train one model together; callbacks, logs and `save` are those
     of process 0.
 
-    Parameters are those of :class:`~sb3_dtfm.algorithms.base.OfflineAlgorithm`.
+    :param policy: "MultiInputPolicy" (or "MlpPolicy", which is the same), or a policy class
+    :param env: environment, or its Gymnasium id; optional, never used for learning. It is wrapped in
+        :class:`~sb3_dtfm.envs.ReturnToGoWrapper` where it is not yet; a vectorised one has to be wrapped inside
+    :param dataset: Minari id or dataset, path to a robomimic hdf5 file or to flat arrays (`.npz`, hdf5), or what is in
+        memory: a dictionary of arrays, a list of episodes, an SB3 `ReplayBuffer`, a
+        :class:`~sb3_dtfm.data.TrajectoryBuffer`; see :func:`~sb3_dtfm.data.load_dataset`
+    :param learning_rate: AdamW's, a number or a function of the progress remaining (from 1 to 0)
+    :param batch_size: windows in a gradient step, of all processes together; by default 64 of less than 10,000 recorded
+        steps, and 256 of more
+    :param weight_decay: AdamW's, on weight matrices only
+    :param context_length: K, steps the policy sees
+    :param return_weighting: w: of mixed data, a step of the best episode is learned from 1 + w times as often as one of the
+        worst, and others by their returns in between (Yue et al., 2022); 0 learns from all alike. By default 5 where
+        returns tell how episodes act, and 0 elsewhere
+    :param dataset_kwargs: further arguments of :func:`~sb3_dtfm.data.load_dataset`: `{"cache_dir": folder}` for datasets
+        larger than memory, `{"fraction": 0.5}` for a random half of the episodes, `{"env_id": id}` for data that were
+        recorded under another environment's name, and the reader's own, for example `{"filter_key": "train"}` for robomimic.
+        `max_episode_steps` is the environment's unless it is given, and stays the model's when it is saved: what episodes
+        hold beyond it is left out, since no episode of the environment gets there; None keeps it
+    :param max_grad_norm: clip the gradient's norm to this; None and 0 do not clip
+    :param warmup_steps: gradient steps over which the learning rate rises linearly from zero; 0 for none
+    :param learning_rate_schedule: factor on the learning rate: "constant", or "linear" or "cosine" down to zero
+    :param ema_decay: decay of the exponential moving average of weights that acts; 0 acts with the trained weights
+    :param precision: of matrix products: "float32", "bfloat16" (autocast), or "auto": bfloat16 where the hardware has
+        instructions for it, on a CPU only if it is the faster one for this model, which is measured once
+    :param compile: compile the loss with `torch.compile`; None does so on a GPU, where one process starts its kernels as a
+        CUDA graph. It takes a minute, and a C++ compiler
+    :param policy_kwargs: arguments of the policy, for example `embed_dim`, `n_layers`, `n_heads`, `dropout`, `kv_cache`. The
+        data decide `dropout`, `chunk_size`, `flow_steps`, `regression_coef`, `timestep_embedding`, `observation_scaling`,
+        `return_conditioning` and `return_range` where they are not given, see :mod:`sb3_dtfm.data.decisions`
+    :param tensorboard_log: folder of the TensorBoard log, None for no log
+    :param verbose: 0 silent, 1 prints the log
+    :param seed: seed of weights, batches and acting
+    :param device: "auto", "cpu" or "cuda"
+    :param _init_setup_model: build the network at once
+    :ivar target_return: to ask for, environment reward units: the environment's, or where it has none the mean return of the
+        best tenth of the recorded episodes, which `sb3-dtfm inspect` suggests. It is saved with the model, and given to each
+        environment of the model that is wrapped without a target. None where a file does not tell
+    :raises ValueError: no dataset, an argument out of range, or an environment that does not fit
+    :raises DatasetError: the dataset cannot be read, or does not fit the environment
     """
 
+    policy: SequencePolicy
+    action_space: ActionSpace
     progress_bar_class: type[ProgressBarCallback] = GradientStepProgressBar
+
+    def __init__(
+        self,
+        policy: str | type[SequencePolicy],
+        env: GymEnv | str | None = None,
+        dataset: Dataset | None = None,
+        learning_rate: float | Schedule = 1e-3,
+        batch_size: int | None = None,
+        weight_decay: float = 1e-3,
+        context_length: int = 1,
+        return_weighting: float | None = None,
+        dataset_kwargs: dict[str, Any] | None = None,
+        max_grad_norm: float | None = None,
+        warmup_steps: int = 100,
+        learning_rate_schedule: str = "cosine",
+        ema_decay: float = 0.999,
+        precision: str = "float32",
+        compile: bool | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            self._get_policy_from_name(policy) if isinstance(policy, str) else policy,
+            env,
+            learning_rate,
+            policy_kwargs=policy_kwargs,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            support_multi_env=True,
+            seed=seed,
+            supported_action_spaces=(spaces.Box, spaces.Discrete),
+        )
+        self.target_return: float | None = None
+        if self.env is not None:
+            self._policy_class.head_for(self.action_space)  # before the data are read, which may take long
+            self.target_return = share_target_return(self.env, None)
+        self.dataset = dataset
+        self.batch_size: int = batch_size  # type: ignore[assignment]  # None until the data have decided
+        self.weight_decay = weight_decay
+        self.context_length = context_length
+        self.return_weighting: float = return_weighting  # type: ignore[assignment]  # as batch_size
+        self.dataset_kwargs = dataset_kwargs
+        self.max_grad_norm = max_grad_norm
+        self.warmup_steps = warmup_steps
+        self.learning_rate_schedule = learning_rate_schedule
+        self.ema_decay = ema_decay
+        self.precision = precision
+        self.compile = compile
+        self.max_timestep = 1000
+        self.time_limit: int | None = None  # of the newest environment that it learned for
+        self.score_reference: ScoreReference | None = None
+        self.decisions: list[Decision] = []
+        self.return_reference: ReturnReference | None = None
+        self.buffer: TrajectoryBuffer | None = None
+        self._means = RunningMeans()
+        self._training_seconds, self._timed_steps = 0.0, 0
+        self._last_saved: str | None = None  # by this object
+        self._current_learning_rate = 0.0
+        self._training_seed: int | None = None  # where `seed` is None
+        if _init_setup_model:
+            self._check_arguments(learning_rate=POSITIVE)
+            buffer = self._read_dataset()
+            self.max_timestep = int(buffer.episode_lengths.max())
+            self._decide(buffer)
+            self.score_reference = buffer.score_reference
+            self._setup_model()
+            taken = self._learn_from(buffer)
+            normalization = self.policy.normalization
+            normalization.set_statistics(*buffer.statistics())
+            if normalization.return_mean is not None:
+                normalization.set_return_to_go_moments(taken.return_to_go_moments())
+            if normalization.return_to_go_range is not None:
+                normalization.set_return_to_go_range(taken.return_to_go_range())
+            if self.policy.critic is not None:
+                self.policy.critic.set_scale(buffer.largest_discounted_return(self.policy.options.gamma))
+
+    def _decide(self, buffer: TrajectoryBuffer) -> None:
+        """Have the data decide of the arguments what the user has left open; they are saved with the others."""
+        given = self.policy_kwargs or {}
+        names = self._policy_class.parameter_names() | {name for name in DECIDED if getattr(self, name) is None}
+        self.decisions = decide_open(buffer, names, given)
+        values = {each.name: each.value for each in self.decisions}
+        for name in DECIDED & set(values):
+            setattr(self, name, values.pop(name))
+        self.policy_kwargs = {**values, **given}
+
+    def _check_arguments(self, learning_rate: Rule) -> None:
+        if isinstance(self.learning_rate, UnsavedSchedule) and learning_rate is POSITIVE:
+            self.learning_rate.check()
+        accepted = ACCEPTED if callable(self.learning_rate) else {**ACCEPTED, "learning_rate": learning_rate}
+        vars(self).update(check_arguments(vars(self), accepted))
+        if self.batch_size is not None:
+            check_batch_size(self.batch_size)
+
+    def set_dataset(self, dataset: Dataset) -> None:
+        """
+        Learn from another dataset from now on; normalisation and spaces stay those of the model.
+
+        :param dataset: as in the constructor
+        :raises DatasetError: it cannot be read, or does not fit the model
+        """
+        self.dataset, self.decisions = dataset, []
+        self._load_buffer()
+
+    def _load_buffer(self) -> TrajectoryBuffer:
+        """The dataset of a model whose settings stand, as it is learned from."""
+        return self._learn_from(self._read_dataset())
+
+    def _read_dataset(self) -> TrajectoryBuffer:
+        """Read the dataset and check it against the spaces, which it defines where there is no environment."""
+        if self.dataset is None:
+            name = type(self).__name__
+            raise ValueError(
+                f"{name} has no dataset to learn from: give one to the constructor, or to a loaded model by "
+                f"{name}.load(path, dataset=...) or model.set_dataset(...)."
+            )
+        if self.env is not None and (task := known_task(self.env)) is not None:
+            self.time_limit = task.max_episode_steps
+        known = {"action_space": getattr(self, "action_space", None), "max_episode_steps": self.time_limit}
+        with local_rank_zero_first():
+            buffer = load_dataset(self.dataset, **{**known, **(self.dataset_kwargs or {})})
+        observation_space = return_to_go_space(buffer.observation_space)
+        if getattr(self, "observation_space", None) is None:
+            self.observation_space, self.action_space, self.n_envs = observation_space, buffer.action_space, 1
+        self._check_spaces(observation_space, buffer.action_space, f"{buffer.source} holds", "the environment's are")
+        if self.env is not None:
+            self._check_task(buffer, self.env)
+        if self.target_return is None:
+            self.target_return = suggested_target_return(buffer)
+            if self.env is not None:
+                share_target_return(self.env, self.target_return)
+                if self.verbose >= 1 and is_first_process():
+                    asked = f"The environment asks for target_return={self.target_return:g}"
+                    print(f"{asked}, as `sb3-dtfm inspect` suggests of the recorded returns.", flush=True)
+        self.return_reference = return_reference(buffer)
+        return buffer
+
+    def _learn_from(self, buffer: TrajectoryBuffer) -> TrajectoryBuffer:
+        """
+        Learn from these episodes from now on.
+
+        :return: them, with the returns-to-go that the model is conditioned on
+        """
+        n_steps = self.policy.options.expected_return_steps
+        if n_steps:
+            if self.verbose >= 1 and is_first_process():
+                print(f"Learning which returns may be expected (expected_return_steps={n_steps})", flush=True)
+            buffer = buffer.to("cpu").with_expected_returns(n_steps)
+        self.buffer = buffer.to(self.device)
+        return self.buffer
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False, *own: BaseCallback) -> BaseCallback:
         if not is_first_process():
             callback, progress_bar, own = None, False, ()
-        if isinstance(callback, list):
-            callback = CallbackList(callback)
-        evaluations = find_eval_callbacks(callback) if isinstance(callback, BaseCallback) else []
+        if progress_bar:
+            own = (self.progress_bar_class(), *own)
+        combined, evaluations = combine_callbacks(callback, self.score_reference, own)
         for evaluation in evaluations:
             name, remedy = "The evaluation environment of EvalCallback", "EvalCallback(ReturnToGoWrapper(eval_env), ...)"
             check_vec_env(evaluation.eval_env, name, remedy)
@@ -68,12 +309,6 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         if self.env is None and evaluations:  # SB3's callbacks ask the model for an environment
             self.n_envs = evaluations[0].eval_env.num_envs
             self.set_env(evaluations[0].eval_env)
-        children = [callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)]
-        if self.score_reference is not None:
-            children.append(NormalizedScoreCallback(self.score_reference, evaluations))
-        if progress_bar:
-            children.append(self.progress_bar_class())
-        combined = CallbackList([*children, *own])
         combined.init_callback(self)
         return combined
 
@@ -178,10 +413,17 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         start = time.perf_counter()
         generator = th.Generator(self.device).manual_seed(step_seed(self._training_seed, self._n_updates, NOISE))
         seed_default_generator(self.device, step_seed(self._training_seed, self._n_updates, DROPOUT, parallel.rank))
-        with self._explain_out_of_memory(), limit_threads(self._n_macs()):
+        with explain_out_of_memory(self.device, *self._sizes()), limit_threads(self._n_macs()):
             self._gradient_step(next(batches), generator, parallel)
         self._training_seconds += time.perf_counter() - start
         self._timed_steps += 1
+
+    def _sizes(self) -> tuple[str, int]:
+        """The arguments that decide how much memory a gradient step needs, and the bytes of a batch."""
+        own, sizes = self.policy.options, {"batch_size": self.batch_size, "context_length": self.context_length}
+        sizes |= {"chunk_size": own.chunk_size, "embed_dim": own.embed_dim, "n_layers": own.n_layers}
+        n_numbers = self.batch_size * self.context_length * (self.policy.observation_dim + self.policy.action_dim)
+        return ", ".join(f"{name}={value}" for name, value in sizes.items()), 4 * n_numbers
 
     def _n_macs(self) -> int:
         """Multiplications of a gradient step, forward and twice as many backward, without attention's."""
@@ -210,15 +452,9 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         """ "float32" or "bfloat16": what was asked for, or what "auto" is here."""
         if self.precision != "auto":
             return self.precision
-        if self.device.type == "cpu" and n_processes() > 1:
-            precision, reason = (
-                "float32",
-                "Matrix products are in float32: each of several processes would measure for itself.",
-            )
-        else:
-            n_rows = self.batch_size * self.context_length * self.policy.network.trunk.tokens_per_step
-            with limit_threads(self._n_macs()):
-                precision, reason = choose_precision(self.policy.network, n_rows, self.device)
+        n_rows = self.batch_size * self.context_length * self.policy.options.tokens_per_step
+        with limit_threads(self._n_macs()):
+            precision, reason = choose_precision(self.policy.network, n_rows, self.device, n_processes())
         if self.verbose >= 1 and is_first_process():
             print(reason, flush=True)
         return precision
@@ -289,18 +525,13 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         n_steps = self._means.n_values
         if n_steps == 0:
             return
-        means = self._pop_means()
+        start = time.perf_counter()
+        means = self._means.pop()
+        self._training_seconds += time.perf_counter() - start  # where a GPU computes them, it is waited for here
         self._check_finite(means, n_steps)
         if is_first_process():
             self._log(means)
         self._training_seconds, self._timed_steps = 0.0, 0
-
-    def _pop_means(self) -> dict[str, float]:
-        """The means since the last call; where a GPU computes them, the time to wait for them is training time."""
-        start = time.perf_counter()
-        means = self._means.pop()
-        self._training_seconds += time.perf_counter() - start
-        return means
 
     def _check_finite(self, means: dict[str, float], n_steps: int = 1) -> None:
         """
@@ -308,13 +539,7 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         :param n_steps: how many these are
         :raises FloatingPointError: the loss or its gradient is no longer finite
         """
-        for name in FINITE:
-            if not math.isfinite(means.get(name, 0.0)):
-                raise FloatingPointError(
-                    f"The {name} became {means[name]} {self._name_steps(n_steps)}. Such steps change no weight, so the last "
-                    f"checkpoint is good: {self._last_saved or 'none was saved since this model was made or loaded'}. Try a "
-                    "lower learning_rate, warmup_steps or max_grad_norm."
-                )
+        check_finite(means, lambda: self._name_steps(n_steps), self._last_saved)
 
     def _name_steps(self, n_steps: int) -> str:
         """Which gradient steps the newest ones are; of a single one, the episodes of its batch, too."""
@@ -325,24 +550,6 @@ class OfflineSequenceAlgorithm(OfflineAlgorithm):
         more = f" and {len(episodes) - N_EPISODES_SHOWN} more" if len(episodes) > N_EPISODES_SHOWN else ""
         shown = ", ".join(map(str, episodes[:N_EPISODES_SHOWN]))
         return f"at gradient step {self._n_updates} of this model, whose batch is from episodes {shown}{more} of its buffer"
-
-    @contextlib.contextmanager
-    def _explain_out_of_memory(self) -> Iterator[None]:
-        """
-        :raises MemoryError: in place of any error of memory, with the settings that decide how much is needed
-        """
-        try:
-            yield
-        except (MemoryError, RuntimeError) as error:
-            # On a CPU torch has no class for it.
-            if isinstance(error, RuntimeError) and not re.search("out of memory|(allocate|enough) memory", str(error), re.I):
-                raise
-            sizes = self.policy.options
-            raise MemoryError(
-                f"A gradient step does not fit into the memory of {self.device}: batch_size={self.batch_size}, "
-                f"context_length={self.context_length}, chunk_size={sizes.chunk_size}, embed_dim={sizes.embed_dim}, "
-                f"n_layers={sizes.n_layers}. Lower batch_size first."
-            ) from error
 
     def _log(self, means: dict[str, float]) -> None:
         for name, mean in means.items():

@@ -3,13 +3,14 @@
 import json
 import math
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import torch as th
 from minari.serialization import serialize_space
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
 from sb3_dtfm.optimization import RunningMeans
@@ -19,7 +20,11 @@ POLICY, OPTIMIZER, CRITIC_OPTIMIZER = "policy", "policy.optimizer", "policy.crit
 CRITIC_PREFIX = "critic."  # of the names of the critic's tensors among the optimiser's
 SPACES = ("observation_space", "action_space")
 # Attributes that have a form of their own in the file.
-ENCODED = (*SPACES, "policy_class", "learning_rate", "_means")
+ENCODED = {*SPACES, "policy_class", "learning_rate", "_means"}
+
+
+# Of `dataset_kwargs`: whoever loads a model says where a cache may lie and whether a pickle may run.
+NEVER_SAVED = ("cache_dir", "allow_pickle")
 
 
 class UnsavedSchedule:
@@ -55,6 +60,9 @@ def to_configuration(model: BaseAlgorithm, left_out: Iterable[str], wanted: Iter
     :raises ValueError: one that is wanted cannot be saved
     """
     attributes = {name: value for name, value in vars(model).items() if name not in {*left_out, *ENCODED}}
+    if attributes.get("dataset_kwargs"):
+        kept = {name: value for name, value in attributes["dataset_kwargs"].items() if name not in NEVER_SAVED}
+        attributes["dataset_kwargs"] = kept
     saved: dict[str, Any] = {}
     for name, value in attributes.items():
         try:
@@ -65,7 +73,7 @@ def to_configuration(model: BaseAlgorithm, left_out: Iterable[str], wanted: Iter
                 raise ValueError(problem) from error
             warnings.warn(problem, stacklevel=3)
     return {
-        "algorithm": head_name(type(model)),
+        "algorithm": head_name(model.policy_aliases),
         "policy_class": _policy_name(model),
         "learning_rate": _learning_rate(model.learning_rate),
         "means": _means(model._means),  # type: ignore[attr-defined]
@@ -81,9 +89,9 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} is not JSON")
 
 
-def head_name(algorithm: type[BaseAlgorithm]) -> str:
-    """What a file calls an algorithm: as its head does, whatever its class is."""
-    policy = algorithm.policy_aliases["MultiInputPolicy"]
+def head_name(policies: Mapping[str, type[BasePolicy]]) -> str:
+    """What a file calls an algorithm: as the head of its policies does, whatever its class is."""
+    policy = policies["MultiInputPolicy"]
     assert issubclass(policy, SequencePolicy)
     return policy.head_class.algorithm
 

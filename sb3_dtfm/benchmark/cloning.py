@@ -106,7 +106,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     import_packages(options.gym_packages)
     ((env_id, settings),) = yaml.safe_load(options.settings.read_text()).items()
     (arguments,) = settings["callback"][-1].values()
-    buffer = read_data(env_id, settings).random_fraction(settings["dataset_fraction"], settings["dataset_seed"])
+    buffer = read_data(env_id, settings)
     best = buffer.best(best_share=settings["best_share"])
     model = Cloning(best, settings["hidden_sizes"], settings["learning_rate"], arguments["row"]["seed"])
     model.learn(settings["n_timesteps"], settings["batch_size"], EvaluationCallback(**arguments))

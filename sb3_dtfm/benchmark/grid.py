@@ -14,6 +14,7 @@ from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.provenance import describe_data, read_data
 from sb3_dtfm.benchmark.rows import BASELINES, Cell, Row, read_rows
 from sb3_dtfm.benchmark.settings import (
+    GRID_DATASET_KEYS,
     Task,
     check_same_trunk,
     cloning_settings,
@@ -202,13 +203,12 @@ def _look_at(task: Task, settings: dict[str, Any]) -> tuple[dict[str, Any], floa
     :raises UsageError: the environment cannot be made
     """
     try:
-        buffer = read_data(task.env_id, settings)
+        kwargs = {key: value for key, value in settings["dataset_kwargs"].items() if key not in GRID_DATASET_KEYS}
+        buffer = read_data(task.env_id, {**settings, "dataset_kwargs": kwargs})
     except (ImportError, TypeError) as error:
         raise UsageError(f"{task.name}, a task of {task.env_id}: {error}") from error
-    whole, share = (
-        buffer.random_fraction(fraction, settings["dataset_seed"])
-        for fraction in (task.fraction, settings["dataset_fraction"])
-    )
+    share_of_all, seed = (settings["dataset_kwargs"][key] for key in GRID_DATASET_KEYS)
+    whole, share = (buffer.random_fraction(fraction, seed) for fraction in (task.fraction, share_of_all))
     described = describe_data(whole, settings["dataset"], task.recorded_from)
     return {**described, **({"chosen_with": True} if task.chosen_with else {})}, suggested_target_return(share)
 

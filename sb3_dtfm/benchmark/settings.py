@@ -16,16 +16,16 @@ from sb3_dtfm.zoo.registration import packaged_config, policy_of, with_policy_op
 
 PROFILES = {"default": None, "paper": "paper"}
 # Keys of the grid; a profile or `-params` that sets them would contradict it.
-GRID_KEYS = ("dataset_fraction", "dataset_seed", "seed")
+GRID_KEYS = ("seed",)
+# Of `dataset_kwargs`.
+GRID_DATASET_KEYS = ("fraction", "fraction_seed")
 # Keys that RL-Zoo takes for itself; the others go to the constructor.
 ZOO_KEYS = {"n_timesteps", "n_envs", "normalize", "env_kwargs", "env_wrapper", "vec_env_wrapper", "callback", "frame_stack"}
 
 # Mappings whose entries replace those of the profile one by one.
 MERGED = ("env_kwargs", "dataset_kwargs")
 # Settings that behaviour cloning shares with the others, and its own.
-CLONING_SHARES = (
-    "dataset", "dataset_kwargs", "dataset_fraction", "dataset_seed", "env_kwargs", "env_wrapper", "vec_env_wrapper"
-)  # fmt: skip
+CLONING_SHARES = ("dataset", "dataset_kwargs", "env_kwargs", "env_wrapper", "vec_env_wrapper")
 CLONING = {"n_timesteps": 5000, "batch_size": 256, "learning_rate": 1e-3, "hidden_sizes": [256, 256, 256]}
 
 
@@ -131,8 +131,9 @@ def task_settings(
     policy_kwargs = {**_mapping(settings, "policy_kwargs"), **_mapping(hyperparams, "policy_kwargs")}
     merged = {key: {**_mapping(settings, key), **getattr(task, key), **_mapping(hyperparams, key)} for key in MERGED}
     settings.update({**hyperparams, **{key: value for key, value in merged.items() if value}})
-    for key in GRID_KEYS:
-        if key in settings:
+    dataset_kwargs = _mapping(settings, "dataset_kwargs")
+    for key in (*GRID_KEYS, *GRID_DATASET_KEYS):
+        if key in (dataset_kwargs if key in GRID_DATASET_KEYS else settings):
             raise UsageError(f"{key}: the grid sets it; leave it out of the profile and of -params.")
     settings = _known(settings, algo, _constructor_parameters)
     settings["policy_kwargs"] = _known(policy_kwargs, algo, _policy_parameters)
@@ -146,7 +147,7 @@ def task_settings(
     missing = [option for key, option in needed.items() if key not in settings]
     if missing:
         raise UsageError(f"{', '.join(missing)}: needed for {task.name}, which --profile {profile} does not list.")
-    settings.update(dataset_fraction=task.fraction * regime, dataset_seed=0)
+    settings["dataset_kwargs"] = {**dataset_kwargs, "fraction": task.fraction * regime, "fraction_seed": 0}
     try:
         yaml.safe_dump(settings)
     except yaml.YAMLError as error:

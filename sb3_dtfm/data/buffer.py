@@ -183,7 +183,7 @@ class TrajectoryBuffer(FlatSteps):
         smallest = max(float(values.std(correction=0)) / 20.0, float(values.abs().max()) / 1000.0)
         return th.stack((mean, variance.sqrt().clamp(min=smallest or 1.0))).float()
 
-    def with_expected_returns(self, n_steps: int, seed: int) -> "TrajectoryBuffer":
+    def with_expected_returns(self, n_steps: int, seed: int = 0) -> "TrajectoryBuffer":
         """
         A buffer whose returns-to-go hardly depend on chance: the rewards after n steps are replaced by the return that may
         be expected after such an observation, an expectile of 0.95 (conditioning on expected returns: Paster et al.,
@@ -401,7 +401,7 @@ class TrajectoryBuffer(FlatSteps):
         :raises ValueError: `fraction` outside of (0, 1]
         """
         if not 0.0 < fraction <= 1.0:
-            raise ValueError(f"dataset_fraction must lie in (0, 1], got {fraction}.")
+            raise ValueError(f"fraction must lie in (0, 1], got {fraction}.")
         if fraction == 1.0:
             return self
         n_kept = max(1, round(fraction * self.n_episodes))

@@ -1,5 +1,6 @@
 """Settings that are chosen from the data where the user gives none, each by a rule of a few lines."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from gymnasium import spaces
@@ -51,6 +52,24 @@ def decide(buffer: TrajectoryBuffer) -> list[Decision]:
     if isinstance(buffer.action_space, spaces.Box):
         decisions += _kind_of_actor(errors, correlation_of_changes(buffer))
     return decisions
+
+
+def decide_open(buffer: TrajectoryBuffer, names: set[str], given: Mapping[str, Any]) -> list[Decision]:
+    """
+    The decisions that a user has left open.
+
+    :param buffer: what is learned from
+    :param names: of the settings that there are
+    :param given: settings by the user, which also rule out decisions about others
+    """
+    names = names - set(given)
+    if given.get("flow_steps") == 0:  # the mean action, which a regression learns
+        names.discard("regression_coef")
+    if given.get("return_conditioning") is False:
+        names.discard("expected_return_steps")
+    if given.get("regression_coef") == 0 or given.get("critic_steps"):  # no mean action; a choice among draws
+        names.discard("flow_steps")
+    return [each for each in decide(buffer) if each.name in names]
 
 
 def sentences(decisions: list[Decision]) -> list[str]:

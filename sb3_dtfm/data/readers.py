@@ -26,7 +26,10 @@ Dataset: TypeAlias = (
     str | os.PathLike[str] | MinariDataset | Mapping[str, Any] | Sequence[Any] | ReplayBuffer | TrajectoryBuffer
 )
 # What load_dataset itself does with a dataset of any kind.
-COMMON_OPTIONS = ("env_id", "action_space", "max_episode_steps", "min_return", "best_share", "success_only")
+COMMON_OPTIONS = (
+    *("env_id", "action_space", "max_episode_steps"),
+    *("min_return", "best_share", "success_only", "fraction", "fraction_seed"),
+)
 
 
 class Reader(NamedTuple):
@@ -107,6 +110,8 @@ def load_dataset(
     min_return: float | None = None,
     best_share: float | None = None,
     success_only: bool = False,
+    fraction: float = 1.0,
+    fraction_seed: int = 0,
     **kwargs: Any,
 ) -> TrajectoryBuffer:
     """
@@ -126,6 +131,8 @@ def load_dataset(
     :param best_share: keep this share of the episodes, those of the largest returns
     :param success_only: keep the successes alone, by what the data say of each episode's last step; see
         :attr:`TrajectoryBuffer.successes`
+    :param fraction: keep this share of the episodes, randomly drawn
+    :param fraction_seed: of that draw alone, so that different runs learn from the same episodes
     :param kwargs: options of the reader: `on_invalid`, which is "raise" unless "drop" leaves episodes out that would be
         refused, with a warning that names their number and the first reason; `filter_key` and `observation_keys` for
         robomimic files, see also :func:`load_flat`
@@ -157,7 +164,7 @@ def load_dataset(
         buffer.env_id = env_id
     if max_episode_steps is not None:
         buffer = buffer.within(max_episode_steps)
-    return buffer.best(min_return, best_share, success_only)
+    return buffer.best(min_return, best_share, success_only).random_fraction(fraction, fraction_seed)
 
 
 def _find_reader(dataset: Any) -> Reader:

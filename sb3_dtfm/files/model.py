@@ -31,10 +31,20 @@ TENSORS_SUFFIX = ".safetensors"
 # Members of a file that Stable-Baselines3 itself, or an earlier version of this package, has written.
 PICKLED = ("data", ".pth", ".pkl", ".pt")
 MAX_CONFIGURATION = 2**24  # bytes
+# Errors of a zip file that is damaged, encrypted, newer than zipfile, or points behind its own end.
+DAMAGE = (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError, OverflowError)
 
 
 class ModelFileError(ValueError):
-    """A file is no model that can be loaded. The message names the file, the member, what was found and what is accepted."""
+    """
+    A file is no model that can be loaded.
+
+    :param message: names the file, the member, what was found and what is accepted; control characters, which a file may
+        hold to change what a terminal shows, are written as escapes
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__("".join(each if each.isprintable() else repr(each)[1:-1] for each in message))
 
 
 class ModelFile(NamedTuple):
@@ -122,7 +132,9 @@ def _archive(file: BinaryIO, name: str) -> Iterator[zipfile.ZipFile]:
     try:
         with zipfile.ZipFile(file) as archive:
             yield archive
-    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:  # also encrypted, or a newer zip
+    except ModelFileError:
+        raise
+    except DAMAGE as error:
         raise ModelFileError(f"{name}: no model of Stable-Baselines3, or a damaged one: {error}.") from error
 
 
@@ -186,7 +198,9 @@ class _Reader:
             self.fail(f"{CONFIGURATION} is missing.")
         try:
             configuration = json.loads(self._content(CONFIGURATION, MAX_CONFIGURATION), parse_constant=self._no_number)
-        except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        except ModelFileError:
+            raise
+        except (ValueError, RecursionError) as error:  # also a number of more digits than Python converts
             self.fail(f"{CONFIGURATION} is not JSON: {error}.")
         if not isinstance(configuration, dict):
             self.fail(f"{CONFIGURATION} holds a {type(configuration).__name__}, expected an object.")

@@ -11,7 +11,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
 from sb3_dtfm.algorithms import DTFM
-from sb3_dtfm.algorithms.base import POLICY_NAMES
+from sb3_dtfm.algorithms.model import POLICY_NAMES
 from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
 from sb3_dtfm.finetuning.online_actor import (
     ACTIVATIONS,

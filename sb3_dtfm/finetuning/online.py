@@ -257,10 +257,9 @@ class OnlineDTFM(DTFM):
         successes, returns = self.replay_buffer.successes, self.replay_buffer.episode_returns
         worthy = np.flatnonzero(np.where(np.isnan(successes), returns >= average, successes == 1.0))
         imitated = self.replay_buffer.select(worthy) if len(worthy) else None
-        if imitated is not None and self.expected_return_steps:
-            imitated = (
-                imitated.to("cpu").with_expected_returns(self.expected_return_steps, self.dataset_seed).to(self.device)
-            )
+        n_expected = self.policy.options.expected_return_steps
+        if imitated is not None and n_expected:
+            imitated = imitated.to("cpu").with_expected_returns(n_expected).to(self.device)
         n_own = self._n_own(imitated, self.batch_size) if imitated is not None else 0
         streams = [self._batches(self.buffer, self.batch_size - n_own)] if n_own < self.batch_size else []
         if imitated is not None:

@@ -192,7 +192,7 @@ def train_arguments(argv: Sequence[str]) -> list[str]:
     conf_file = options.conf_file
     if options.algo in ALGORITHMS and conf_file in PACKAGED_CONFIGS:
         conf_file = str(packaged_config(options.algo, conf_file))
-    shorthands = _shorthands(options, given, _wrappers(conf_file, options.env))
+    shorthands = _shorthands(options, {**_listed(conf_file, options.env), **given})
     if options.algo not in ALGORITHMS and shorthands:
         names = ", ".join(option for option, _ in shorthands)
         raise UsageError(f"{names}: for --algo {' and '.join(ALGORITHMS)} only, not for {options.algo}.")
@@ -217,23 +217,28 @@ def _check_task(conf_file: str, env_id: str, hyperparams: Sequence[str]) -> None
         raise UsageError(f"--dataset: needed for {env_id}, which {conf_file} does not list.")
 
 
-def _wrappers(conf_file: str | None, env_id: str) -> Any:
-    """What wraps a task, as a YAML file has it; nothing in a file of another kind, or where there is none to read."""
+def _listed(conf_file: str | None, env_id: str) -> dict[str, Any]:
+    """The settings of a task in a YAML file; none in a file of another kind, or where there is none to read."""
     if conf_file is None or not Path(conf_file).is_file() or Path(conf_file).suffix not in (".yml", ".yaml"):
-        return []
+        return {}
     entries = yaml.safe_load(Path(conf_file).read_text()) or {}
-    return (entries.get(env_id) or entries.get("default") or {}).get("env_wrapper") or []
+    return entries.get(env_id) or entries.get("default") or {}
 
 
-def _shorthands(options: argparse.Namespace, given: dict[str, Any], wrappers: Any) -> list[tuple[str, str]]:
-    """Pairs of an option that was given and its `key:value`, whose value RL-Zoo evaluates as Python."""
-    wrapper = asking_for(options.target_return, given.get("env_wrapper") or wrappers)
-    cached = {**(given.get("dataset_kwargs") or {}), "cache_dir": options.dataset_cache}
+def _shorthands(options: argparse.Namespace, settings: dict[str, Any]) -> list[tuple[str, str]]:
+    """
+    :param settings: of the task without these options
+    :return: pairs of an option that was given and its `key:value`, whose value RL-Zoo evaluates as Python
+    """
+    wrapper = asking_for(options.target_return, settings.get("env_wrapper") or [])
+    of_the_data = {"fraction": options.dataset_fraction, "cache_dir": options.dataset_cache}
+    wanted = {name: value for name, value in of_the_data.items() if value is not None}
+    kwargs = {**(settings.get("dataset_kwargs") or {}), **wanted}
     dataset = options.dataset[0] if options.dataset and len(options.dataset) == 1 else options.dataset
     candidates = [
         ("--dataset", "dataset", dataset, dataset),
-        ("--dataset-fraction", "dataset_fraction", options.dataset_fraction, options.dataset_fraction),
-        ("--dataset-cache", "dataset_kwargs", options.dataset_cache, cached),
+        ("--dataset-fraction", "dataset_kwargs", options.dataset_fraction, kwargs),
+        ("--dataset-cache", "dataset_kwargs", options.dataset_cache, kwargs),
         ("--target-return", "env_wrapper", options.target_return, wrapper),
     ]
     return [(option, f"{key}:{value!r}") for option, key, wanted, value in candidates if wanted is not None]

@@ -275,7 +275,7 @@ class OnlineManager(FinetuningManager):
     """
 
     command = "finetune"
-    of_the_data = ("dataset", "dataset_fraction", "dataset_seed", "dataset_kwargs", "vec_env_wrapper")
+    of_the_data = ("dataset", "dataset_kwargs", "vec_env_wrapper")
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

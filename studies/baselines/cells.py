@@ -67,7 +67,7 @@ class Data(NamedTuple):
     def settings(self) -> dict[str, Any]:
         """What our own runs are told of data and environment."""
         found = self._our_settings()
-        names = ("dataset", "dataset_kwargs", "dataset_fraction", "dataset_seed", "env_wrapper", "env_kwargs")
+        names = ("dataset", "dataset_kwargs", "env_wrapper", "env_kwargs")
         return {name: found[name] for name in names if name in found}
 
     def _our_settings(self) -> dict[str, Any]:
@@ -151,7 +151,6 @@ def export(data: Data, baseline: Baseline, path: Path, max_episode_steps: int | 
     settings = data.settings()
     options = {"max_episode_steps": max_episode_steps, **(settings.get("dataset_kwargs") or {})}
     buffer = load_dataset(settings["dataset"], **options)
-    buffer = buffer.random_fraction(settings["dataset_fraction"], settings["dataset_seed"])
     if baseline.best_share is not None:
         buffer = buffer.best(best_share=baseline.best_share)
     buffer.save(path)

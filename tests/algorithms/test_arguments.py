@@ -21,13 +21,10 @@ REFUSED = {
     "weight_decay": (-1, NAN),
     "learning_rate": (0, -1, NAN),
     "ema_decay": (1.0, -0.1, NAN),
-    "dataset_fraction": (0, 1.5, NAN),
     "return_weighting": (-1.0, float("inf"), NAN),
-    "expected_return_steps": (-1, 2.5),
     "precision": ("float8",),
     "learning_rate_schedule": ("step",),
     "compile": ("yes", 1),
-    "dataset_seed": (-1, 2.5, None),
     "seed": (-1, 2.5),
 }
 REFUSED_OF_THE_POLICY = {
@@ -45,6 +42,7 @@ REFUSED_OF_THE_POLICY = {
     "film_return_to_go": ("no", None),
     "observation_scaling": ("mean", True),
     "kv_cache": ("no", 1),
+    "expected_return_steps": (-1, 2.5),
 }
 REFUSED_OF_THE_FLOW = {
     "flow_hidden_dim": (0, 2.5),
@@ -162,7 +160,7 @@ def test_an_unknown_argument_of_the_policy_is_refused_with_those_accepted(algori
 NUMPY = dict(
     batch_size=np.int64(8), context_length=np.int32(4), learning_rate=np.float32(1e-3), weight_decay=np.float64(0.01),
     warmup_steps=np.int64(2), max_grad_norm=np.float32(0.5), ema_decay=np.float64(0.9),
-    dataset_fraction=np.float32(0.5), dataset_seed=np.int64(1), return_weighting=np.float32(5.0),
+    return_weighting=np.float32(5.0),
 )  # fmt: skip
 NUMPY_POLICY = dict(
     embed_dim=np.int64(16), n_layers=np.int64(1), n_heads=np.int32(2), dropout=np.float32(0.1),

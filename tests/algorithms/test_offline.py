@@ -122,7 +122,7 @@ def test_the_seed_decides_everything(cheetah_buffer):
 
 
 def test_both_algorithms_start_from_the_same_trunk_and_learn_from_the_same_half(cheetah_buffer):
-    dt, dtfm = (make_model(algorithm, cheetah_buffer, dataset_fraction=0.5, seed=1) for algorithm in (DT, DTFM))
+    dt, dtfm = (make_model(algorithm, cheetah_buffer, dataset_kwargs=dict(fraction=0.5), seed=1) for algorithm in (DT, DTFM))
     for ours, theirs in zip(dt.policy.network.trunk.parameters(), dtfm.policy.network.trunk.parameters(), strict=True):
         assert th.equal(ours, theirs)
     assert dt.buffer.n_episodes == dtfm.buffer.n_episodes == 3
@@ -137,7 +137,10 @@ def test_a_cache_trains_the_same_model_as_memory(cheetah_buffer, tmp_path):
         return TrajectoryBuffer.from_trajectories(episodes, cheetah_buffer.action_space, storage=storage)
 
     cached = load_cached(tmp_path, Fingerprint("cheetah", "", "", ""), read)
-    models = [make_model(DTFM, buffer, dataset_fraction=0.5).learn(5, log_interval=2) for buffer in (cheetah_buffer, cached)]
+    models = [
+        make_model(DTFM, buffer, dataset_kwargs=dict(fraction=0.5)).learn(5, log_interval=2)
+        for buffer in (cheetah_buffer, cached)
+    ]
     assert models[1].buffer.memory_mapped
     assert th.equal(*map(weights, models))
 
@@ -233,7 +236,8 @@ def test_without_time_steps_and_with_better_episodes_more_often(algorithm, polic
 
 def test_expected_returns_are_what_is_learned_from_and_asked_for(cheetah_buffer, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(expected, "N_TIMESTEPS", 20)
-    model = make_model(DTFM, cheetah_buffer, expected_return_steps=10, policy_kwargs=dict(clip_return_to_go=True), verbose=1)
+    policy_kwargs = dict(clip_return_to_go=True, expected_return_steps=10)
+    model = make_model(DTFM, cheetah_buffer, policy_kwargs=policy_kwargs, verbose=1)
     assert "Learning which returns may be expected (expected_return_steps=10)" in capsys.readouterr().out
     wanted = cheetah_buffer.with_expected_returns(10, seed=0)
     assert th.equal(model.buffer.returns_to_go, wanted.returns_to_go)
@@ -241,7 +245,7 @@ def test_expected_returns_are_what_is_learned_from_and_asked_for(cheetah_buffer,
     assert model.score_reference == cheetah_buffer.score_reference
     model.learn(2).save(tmp_path / "model")
     loaded = DTFM.load(tmp_path / "model", dataset=cheetah_buffer)
-    assert loaded.expected_return_steps == 10
+    assert loaded.policy.options.expected_return_steps == 10
     loaded.learn(1)
     assert th.equal(loaded.buffer.returns_to_go, wanted.returns_to_go)
 

@@ -10,10 +10,10 @@ NAMED = r"batch_size=(\d+), context_length=5, chunk_size=1, embed_dim=32, n_laye
 
 
 def test_a_batch_larger_than_any_memory_is_named(cheetah_buffer):
-    model = make_model(DT, cheetah_buffer, batch_size=10**17)
-    with pytest.raises(MemoryError, match=f"{NAMED}.*batch_size") as caught:
+    """Before any of it is taken: an operating system may grant it, and end the process when it is used."""
+    model = make_model(DT, cheetah_buffer, batch_size=10**9)
+    with pytest.raises(MemoryError, match=rf"takes 460.0 GB, and cpu has [\d.,]+: {NAMED}. Lower batch_size"):
         model.learn(1)
-    assert isinstance(caught.value.__cause__, RuntimeError)
 
 
 OUT_OF_MEMORY = [
@@ -32,7 +32,7 @@ def test_any_error_of_memory_is_named_and_leaves_the_weights_alone(error, cheeta
     def fail(*args):
         raise error
 
-    monkeypatch.setattr(model.policy, "compute_loss", fail)
+    monkeypatch.setattr(model, "compute_loss", fail)
     with pytest.raises(MemoryError, match=NAMED) as caught:
         model.learn(1)
     assert caught.value.__cause__ is error
@@ -46,7 +46,7 @@ def test_other_errors_stay_what_they_are(cheetah_buffer, monkeypatch):
     def fail(*args):
         raise error
 
-    monkeypatch.setattr(model.policy, "compute_loss", fail)
+    monkeypatch.setattr(model, "compute_loss", fail)
     with pytest.raises(RuntimeError) as caught:
         model.learn(1)
     assert caught.value is error

@@ -47,7 +47,7 @@ def test_any_environment_asks_for_what_inspect_suggests(env, cheetah_buffer, cap
 
 
 def test_the_best_tenth_are_the_episodes_that_are_learned_from(cheetah_buffer):
-    half = make_model(DT, cheetah_buffer, dataset_fraction=0.5)
+    half = make_model(DT, cheetah_buffer, dataset_kwargs=dict(fraction=0.5))
     assert half.target_return == float(f"{half.buffer.episode_returns.max():.4g}")
 
 
@@ -122,7 +122,7 @@ def test_a_changed_target_is_a_finite_number(cheetah_buffer, tmp_path):
 
 def test_an_exported_model_knows_the_target(cheetah_buffer, tmp_path, monkeypatch):
     written = []
-    monkeypatch.setattr("sb3_dtfm.algorithms.base.write_onnx", lambda *arguments: written.append(arguments[-1]))
+    monkeypatch.setattr("sb3_dtfm.algorithms.model.write_onnx", lambda *arguments: written.append(arguments[-1]))
     model = make_model(DT, cheetah_buffer)
     model.export(tmp_path / "policy.onnx")
     assert written[0]["target_return"] == model.target_return

@@ -223,7 +223,7 @@ def test_the_packaged_profiles_differ_in_the_head_only(profile, env_id):
     assert set(dtfm["policy_kwargs"]) - set(dt["policy_kwargs"]) == own
     dtfm["policy_kwargs"] = {key: value for key, value in dtfm["policy_kwargs"].items() if key not in own}
     assert dt == dtfm
-    assert (dt["dataset_fraction"], dt["dataset_seed"]) == (0.5, 0)
+    assert dt["dataset_kwargs"] == {"fraction": 0.5, "fraction_seed": 0}
 
 
 @pytest.mark.parametrize("nested", [True, False])
@@ -279,7 +279,7 @@ def test_several_data_sets_of_a_task_are_told_apart_by_their_names(suite):
     assert {job.row["env_id"] for job in jobs} == {TASK}
     assert [job.data.get("chosen_with", False) for job in jobs] == [True] * 8 + [False] * 4
     some = [job for job in jobs if job.cell.task == "some"]
-    assert [job.settings["dataset_fraction"] for job in some] == [0.67, 0.67, 0.335, 0.335]
+    assert [job.settings["dataset_kwargs"]["fraction"] for job in some] == [0.67, 0.67, 0.335, 0.335]
     assert {job.data["n_episodes"] for job in some} == {2}, "of three, whatever share of the two is learned from"
     assert {job.data["n_steps"] for job in some} == {40}, "up to the time limit"
     assert {job.settings["env_kwargs"]["ctrl_cost_weight"] for job in some} == {0.2}
@@ -395,7 +395,7 @@ def test_algorithms_with_different_trunks_are_refused(grid, workplace):
         (["--env", TASK, "--fractions", "2"], "--fractions: must lie in (0, 1], got 2.0"),
         (["--env", TASK, "--jobs", "0"], "--jobs: must be at least 1, got 0"),
         (["--env", TASK, "-params", "ema_decay:0.9"], "-params: needs --label"),
-        (["--env", TASK, "--label", "a", "-params", "dataset_seed:1"], "dataset_seed: the grid sets it"),
+        (["--env", TASK, "--label", "a", "-params", "dataset_kwargs:dict(fraction=0.5)"], "fraction: the grid sets it"),
         (["--env", TASK, "--label", "a", "-params", "ema:1"], "ema: no setting of dt"),
         (["--env", TASK, "--label", "a", "-params", "ema_decay"], "-params ema_decay: expected key:value"),
         (["--env", TASK, "--label", "a", "-params", "precision:object()"], "a setting that YAML cannot hold"),

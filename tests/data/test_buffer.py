@@ -239,7 +239,7 @@ def test_random_fraction_is_the_same_for_the_same_seed():
 
 @pytest.mark.parametrize("fraction", [0.0, -0.5, 1.5, float("nan")])
 def test_random_fraction_outside_of_its_range_is_refused(fraction: float):
-    with pytest.raises(ValueError, match="dataset_fraction"):
+    with pytest.raises(ValueError, match="fraction"):
         make_buffer([3]).random_fraction(fraction, 0)
 
 

@@ -19,6 +19,8 @@ from stable_baselines3.common.save_util import save_to_zip_file
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_dtfm import DT, DTFM
+from sb3_dtfm.algorithms.loading import SAVED
+from sb3_dtfm.algorithms.offline import ACCEPTED
 from sb3_dtfm.files import ModelFileError
 from tests.algorithms.small import make_model
 from tests.conftest import make_env
@@ -219,6 +221,8 @@ BAD_CONFIGURATIONS = [
     (("action_space",), '{"type": "MultiBinary", "n": 3}', "action_space: the action space is MultiBinary(3)"),
     (("action_space",), '{"type":"Box","dtype":"float32","shape":[1],"low":[-Infinity],"high":[Infinity]}', "bounded Box"),
     (("learning_rate",), -1.0, "learning_rate must be"),
+    (("learning_rate",), 10**400, "learning_rate must be"),
+    (("learning_rate",), {"start": 1, "end": 0, "end_fraction": 0.0}, "expected start, end and end_fraction"),
     (("learning_rate",), {"start": 1}, "expected start, end and end_fraction"),
     (("learning_rate",), {"__class__": 1}, "expected start, end and end_fraction"),
     (("means",), {"n_values": -1, "sums": {}}, "means are"),
@@ -231,6 +235,19 @@ BAD_CONFIGURATIONS = [
     (("attributes", "context_length"), 10**12, "context_length must be"),
     (("attributes", "batch_size"), 1.5, "batch_size must be"),
     (("attributes", "num_timesteps"), -1, "num_timesteps must be"),
+    (("attributes", "num_timesteps"), 10**400, "num_timesteps must be"),
+    (("attributes", "dataset"), "evil.npz", "'dataset' is no attribute"),
+    (("attributes", "tensorboard_log"), "/etc", "'tensorboard_log' is no attribute"),
+    (("attributes", "unheard_of"), 1, "'unheard_of' is no attribute"),
+    (("attributes", "\x1b[2J"), 1, r"'\x1b[2J' is no attribute"),
+    (("attributes", "n_envs"), 10**12, "n_envs must be"),
+    (("attributes", "_training_seed"), "x", "_training_seed must be"),
+    (("attributes", "_training_seed"), 2**64, "_training_seed must be"),
+    (("attributes", "_stats_window_size"), 10**12, "_stats_window_size must be"),
+    (("attributes", "_current_progress_remaining"), 7, "_current_progress_remaining must be"),
+    (("attributes", "verbose"), 10**9, "verbose must be"),
+    (("attributes", "use_sde"), True, "use_sde must be"),
+    (("attributes", "start_time"), "now", "start_time must be"),
     (("attributes", "_n_updates"), None, "_n_updates must be"),
     (("attributes", "max_timestep"), 10**9, "return_to_go_range"),
     (("attributes", "ema_decay"), 2, "ema_decay must be"),
@@ -251,6 +268,9 @@ BAD_CONFIGURATIONS = [
     (("attributes", "return_reference"), [1.0, 2.0, 2.0, 3, False, 1.5, None], "expected recorded, best_tenth, best, n_"),
     (("attributes", "return_reference"), [1.0, 2.0, 2.0, 3, 0.5, None, None], "expected recorded, best_tenth, best, n_"),
     (("attributes", "policy_kwargs"), 7, "policy_kwargs"),
+    (("attributes", "dataset_kwargs"), {"cache_dir": "/etc"}, "without cache_dir and allow_pickle"),
+    (("attributes", "dataset_kwargs"), {"allow_pickle": True}, "without cache_dir and allow_pickle"),
+    (("attributes", "dataset_kwargs"), "x", "dataset_kwargs are 'x'"),
     (("members",), {}, "does not describe the members"),
     (("members", "../evil.safetensors"), {"bytes": 1}, "does not describe the members"),
     (("members", "policy.safetensors", "bytes"), 2**60, "bytes"),
@@ -317,11 +337,35 @@ def test_members_that_are_missing_too_many_or_not_what_they_claim_are_refused(sa
         assert name in refused(packed({key: part for key, part in parts.items() if key != name}), tmp_path)
     assert "notes.txt: nothing of this name" in refused(packed({**parts, "notes.txt": b"hello"}), tmp_path)
     assert "is compressed" in refused(packed(parts, zipfile.ZIP_DEFLATED), tmp_path)
-    for text in (b"{", b"[]", b"\xff", b"[" * 10**5, b'{"format": NaN}'):
+    for text in (b"{", b"[]", b"\xff", b"[" * 10**5, b'{"format": NaN}', b"7" * 5000):
         assert "model.json" in refused(packed({**parts, "model.json": text}), tmp_path)
     claims = struct.pack("<Q", 2**62) + parts["policy.safetensors"][8:]
     forged_header = forged(packed({**parts, "policy.safetensors": claims}), lambda configuration: None)
     assert "policy.safetensors" in refused(forged_header, tmp_path)
+
+
+def test_a_directory_that_leads_nowhere_is_refused(saved, tmp_path):
+    """An offset behind the file's end, and a name that is no UTF-8."""
+    end = saved.rindex(b"PK\5\6")
+    for offset in (2**31, 2**32 - 2):
+        assert "damaged" in refused(saved[: end + 16] + struct.pack("<I", offset) + saved[end + 20 :], tmp_path)
+    entry = saved.rindex(b"PK\1\2", 0, saved.rindex(b"system_info.txt"))
+    utf8 = saved[: entry + 8] + struct.pack("<H", 0x800) + saved[entry + 10 :]
+    name = utf8.rindex(b"system_info.txt")
+    assert "damaged" in refused(utf8[:name] + b"\xff" + utf8[name + 1 :], tmp_path)
+
+
+def test_each_attribute_in_a_file_has_a_rule(saved):
+    """So that no file sets what nobody looks at."""
+    own = {"policy_kwargs", "dataset_kwargs", "score_reference", "return_reference"}
+    assert set(json.loads(members(saved)["model.json"])["attributes"]) <= {*SAVED, *ACCEPTED, *own}
+
+
+def test_a_cache_folder_is_not_saved(cheetah_buffer, tmp_path):
+    cheetah_buffer.save(tmp_path / "data.npz")
+    kwargs = {"cache_dir": str(tmp_path / "cache"), "fraction": 0.5}
+    make_model(DT, tmp_path / "data.npz", dataset_kwargs=kwargs).save(tmp_path / "model")
+    assert DT.load(tmp_path / "model").dataset_kwargs == {"fraction": 0.5}
 
 
 def test_a_bomb_is_refused_before_it_grows(saved, tmp_path):

@@ -144,9 +144,10 @@ def test_the_seed_is_the_environments_too(file, cheetah_buffer):
     np.testing.assert_array_equal(*firsts)
 
 
-def test_own_returns_are_expected_ones_as_the_datasets_are(file, cheetah_buffer, monkeypatch):
+def test_own_returns_are_expected_ones_as_the_datasets_are(cheetah_buffer, monkeypatch, tmp_path):
     monkeypatch.setattr("sb3_dtfm.data.expected.N_TIMESTEPS", 100)
-    model = OnlineDTFM.load(file, make_venv(), dataset=cheetah_buffer, expected_return_steps=2, **ONLINE)
+    make_model(DTFM, cheetah_buffer, policy_kwargs={**CHUNKS, "expected_return_steps": 2}).save(tmp_path / "model")
+    model = OnlineDTFM.load(tmp_path / "model", make_venv(), dataset=cheetah_buffer, **ONLINE)
     model.set_dataset(cheetah_buffer)
     model.replay_buffer = cheetah_buffer.best(best_share=0.2)
     asked = []

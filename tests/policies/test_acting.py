@@ -241,7 +241,7 @@ def test_a_call_that_fails_leaves_the_cache_as_it_was(model, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(model.policy.acting_network.trunk, "extend", fail)
+        patch.setattr("sb3_dtfm.networks.cache.extend", fail)
         with pytest.raises(KeyboardInterrupt):
             model.predict(following, state=state, deterministic=True)
     after, _ = model.predict(following, state=state, deterministic=True)

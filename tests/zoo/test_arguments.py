@@ -58,7 +58,7 @@ def test_shorthands_join_the_users_hyperparameters():
         "batch_size": 8,
         "seed": 3,
         "dataset": "it's a/file:1.hdf5",
-        "dataset_fraction": 0.5,
+        "dataset_kwargs": {"fraction": 0.5},
         "env_wrapper": [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 3000.0}}],
     }
     assert read.n == 5

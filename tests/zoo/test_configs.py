@@ -14,6 +14,7 @@ from rl_zoo3.utils import get_wrapper_class
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.heads import FlowHead
+from sb3_dtfm.policies.options import PolicyOptions
 from sb3_dtfm.zoo.registration import packaged_config, policy_of, register
 
 TARGETS = {
@@ -87,6 +88,7 @@ def test_the_papers_settings():
         "return_scaling": "max",
         "clip_return_to_go": False,
         "film_return_to_go": False,
+        "expected_return_steps": 0,
         "observation_scaling": "std",
         "flow_hidden_dim": 512,
         "flow_n_layers": 3,
@@ -109,7 +111,6 @@ def test_the_papers_settings():
         "weight_decay": 1e-3,
         "ema_decay": 0.0,
         "return_weighting": 0.0,
-        "expected_return_steps": 0,
         "precision": "auto",
     }
 
@@ -132,7 +133,7 @@ def test_a_search_can_find_the_packaged_settings(algo, settings):
         for each in (algorithm, policy)
         for name, parameter in inspect.signature(each).parameters.items()
     }
-    defaults.update(policy.head_class.options_class.defaults())
+    defaults.update({**PolicyOptions.defaults(), **policy.head_class.options_class.defaults()})
     for hyperparams in load(algo, settings).values():
         policy_kwargs = copy.copy(hyperparams.get("policy_kwargs", {}))
         for key in {"flow_solver", "one_step_policy", "return_scaling", "return_conditioning", "regression_coef"} & set(

@@ -6,7 +6,7 @@ from typing import Any
 from sb3_dtfm.benchmark.report.runs import Group, Run, Study
 
 # Settings that tell cells apart, not labels.
-NOT_A_CHANGE = ("dataset", "dataset_fraction", "dataset_seed")
+NOT_A_CHANGE = ("dataset", "dataset_fraction", "dataset_seed", "fraction", "fraction_seed")
 
 
 def split_changes(study: Study, studies: Sequence[Study]) -> tuple[list[Group], list[tuple[Group, list[Group]]]]:
@@ -49,9 +49,10 @@ def changed_settings(run: Run, base: Sequence[Run]) -> str:
 
 
 def _flat(settings: dict[str, Any]) -> dict[str, Any]:
-    """`policy_kwargs` beside the others, and the target return out of its wrapper."""
-    flat = {key: value for key, value in settings.items() if key not in ("policy_kwargs", "env_wrapper")}
-    flat.update(settings.get("policy_kwargs") or {})
+    """`policy_kwargs` and `dataset_kwargs` beside the others, and the target return out of its wrapper."""
+    apart = ("policy_kwargs", "dataset_kwargs", "env_wrapper")
+    flat = {key: value for key, value in settings.items() if key not in apart}
+    flat.update({**(settings.get("policy_kwargs") or {}), **(settings.get("dataset_kwargs") or {})})
     for wrapper in settings.get("env_wrapper") or []:
         for arguments in wrapper.values() if isinstance(wrapper, dict) else []:
             flat.update(arguments)
