@@ -139,10 +139,10 @@ def explain_out_of_memory(device: th.device, sizes: str, n_bytes: int = 0) -> It
     :param n_bytes: a batch alone takes; more than the device has are refused before an operating system ends the process
     :raises MemoryError: in place of any error of memory, with these settings
     """
-    if n_bytes > (there := total_memory(device)):
-        raise MemoryError(
-            f"A batch alone takes {n_bytes / 1e9:,.1f} GB, and {device} has {there / 1e9:,.1f}: {sizes}. Lower batch_size first."
-        )
+    there = total_memory(device)
+    if n_bytes > there:
+        found = f"A batch alone takes {n_bytes / 1e9:,.1f} GB, and {device} has {there / 1e9:,.1f}"
+        raise MemoryError(f"{found}: {sizes}. Lower batch_size first.")
     try:
         yield
     except (MemoryError, RuntimeError) as error:

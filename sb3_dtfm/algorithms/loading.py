@@ -166,8 +166,8 @@ def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
         raise ModelFileError(f"{source}: policy_kwargs are {attributes['policy_kwargs']!r}, expected arguments by name.")
     dataset_kwargs = attributes.get("dataset_kwargs") or {}
     if not isinstance(dataset_kwargs, dict) or set(NEVER_SAVED) & set(dataset_kwargs):
-        accepted = f"arguments by name, without {' and '.join(NEVER_SAVED)}"
-        raise ModelFileError(f"{source}: dataset_kwargs are {dataset_kwargs!r}, expected {accepted}.")
+        expected = f"arguments by name, without {' and '.join(NEVER_SAVED)}"
+        raise ModelFileError(f"{source}: dataset_kwargs are {dataset_kwargs!r}, expected {expected}.")
     reference = attributes.get("score_reference")
     kinds = [type(each) for each in reference] if isinstance(reference, list) else reference
     if kinds not in (None, [float, float, str]) or (reference and not reference[0] < reference[1]):

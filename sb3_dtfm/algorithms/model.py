@@ -19,8 +19,8 @@ from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dtfm.actions import ActionSpace, same_actions
-from sb3_dtfm.algorithms.loading import SAVED, SavedModel, check_policy, parameters, read_saved, wrap_file_errors
-from sb3_dtfm.algorithms.saving import ENCODED, OPTIMIZER, POLICY, optimizer_tensors, optimizers, to_configuration
+from sb3_dtfm.algorithms.loading import SavedModel, check_policy, parameters, read_saved, wrap_file_errors
+from sb3_dtfm.algorithms.saving import OPTIMIZER, POLICY, optimizer_tensors, optimizers, to_configuration
 from sb3_dtfm.arguments import NOT_NEGATIVE, Rule, documented_parameters
 from sb3_dtfm.data import DatasetError, ReturnReference, ScoreReference, TrajectoryBuffer, check_action_space
 from sb3_dtfm.distributed import is_first_process
@@ -246,9 +246,9 @@ class SequenceModel(BaseAlgorithm):
                 f"{source} is a fine-tuned DTFM: sb3_dtfm.finetuning.FinetunedDTFM loads it. To go on learning, `sb3-dtfm "
                 "finetune -i` takes the agent.zip beside it, and --model the DTFM that it began with."
             )
-        known = {*vars(model), *SAVED, *ENCODED} - (set(model._excluded_save_params()) - set(custom_objects))
-        for name in attributes:
-            if name not in known:
+        never = set(model._excluded_save_params()) - set(custom_objects)
+        for name in attributes:  # others than the model's own are a user's, which nothing here reads
+            if name in never or hasattr(cls, name) or not name.isidentifier():
                 raise ModelFileError(f"{source}: {name!r} is no attribute that a model is saved with.")
         vars(model).update(attributes)
         model._check_saved(saved)

@@ -32,7 +32,7 @@ TENSORS_SUFFIX = ".safetensors"
 PICKLED = ("data", ".pth", ".pkl", ".pt")
 MAX_CONFIGURATION = 2**24  # bytes
 # Errors of a zip file that is damaged, encrypted, newer than zipfile, or points behind its own end.
-DAMAGE = (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError, OverflowError)
+DAMAGE = (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError, OverflowError, OSError)
 
 
 class ModelFileError(ValueError):
