@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 
 from sb3_dtfm.data.cache import existing_file
-from sb3_dtfm.data.hdf5 import read_hdf5
+from sb3_dtfm.data.hdf5 import check_within, read_hdf5
 from sb3_dtfm.data.observations import as_vectors
 from sb3_dtfm.data.trajectories import DatasetError, check_real, check_size, wrap_dataset_errors
 
@@ -117,6 +117,7 @@ class _Hdf5(Arrays):
     """Of an opened file, at its top."""
 
     def __init__(self, file: h5py.File, source: str) -> None:
+        check_within(file, "infos", source)
         infos = file.get("infos")
         within = {f"infos/{name}" for name in infos} if isinstance(infos, h5py.Group) else set()
         super().__init__(source, {*file, *within}, os.path.getsize(source))

@@ -64,7 +64,7 @@ def is_flat_file(dataset: Any) -> bool:
         path = os.path.expanduser(dataset)
         if os.path.isfile(path) and h5py.is_hdf5(path):
             with h5py.File(path, "r") as file:
-                return any(name in file for name in ACTIONS)
+                return not set(file).isdisjoint(ACTIONS)
     return False
 
 

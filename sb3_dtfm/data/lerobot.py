@@ -140,7 +140,7 @@ def _read(folder: Path, names: Sequence[str], n_frames: int, source: str) -> tup
     :param names: of the columns
     :param n_frames: N, as the dataset tells
     """
-    paths = [path for path in files_below(folder / DATA) if path.suffix == ".parquet"]
+    paths = [path for path in files_below(folder, DATA) if path.suffix == ".parquet"]
     if not paths:
         raise DatasetError(f"{source}: there is no parquet file below {DATA}.")
     pyarrow = import_pyarrow(source)

@@ -19,7 +19,7 @@ from minari.storage import get_dataset_path
 
 from sb3_dtfm.data.arrow import import_pyarrow
 from sb3_dtfm.data.buffer import TrajectoryBuffer
-from sb3_dtfm.data.cache import Fingerprint
+from sb3_dtfm.data.cache import Fingerprint, existing_file, files_below
 from sb3_dtfm.data.hdf5 import open_group, read_hdf5
 from sb3_dtfm.data.observations import ReadArray, flatten_observations
 from sb3_dtfm.data.storage import FileStorage
@@ -174,7 +174,7 @@ def read_metadata(folder: Path, dataset_id: str) -> dict[str, Any]:
     path = folder / METADATA_FILE_NAME
     source = f"Minari dataset {dataset_id} ({path})"
     with wrap_dataset_errors(source):
-        metadata = json.loads(path.read_text())
+        metadata = json.loads(existing_file(path, "what a Minari dataset says of itself").read_text())
     if not isinstance(metadata, dict):
         raise DatasetError(f"{source}: holds a {type(metadata).__name__}; a JSON object is expected.")
     _check_fields(metadata, source)
@@ -222,7 +222,7 @@ def _n_episodes(folder: Path, data_format: str, dataset_id: str) -> int:
     with wrap_dataset_errors(f"Minari dataset {dataset_id} ({data})"):
         if data_format != "hdf5":
             return sum(path.name.isdigit() for path in data.iterdir())
-        with h5py.File(data, "r") as file:
+        with h5py.File(existing_file(data, "an hdf5 file"), "r") as file:
             return sum(name.startswith("episode_") for name in file)
 
 
@@ -260,8 +260,8 @@ def _hdf5_reader(stack: contextlib.ExitStack, folder: Path, source: str) -> Call
     def episode(index: int) -> _Episode:
         group = open_group(file, f"episode_{index}", source)
         where = f"{source}, episode {index}"
-        infos = (f"{INFOS}/{name}" for name in SUCCESS if INFOS in group)
-        told = next((name for name in infos if name in group), None)
+        infos = set(open_group(group, INFOS, where)) if INFOS in set(group) else set()
+        told = next((f"{INFOS}/{name}" for name in SUCCESS if name in infos), None)
 
         def array(*path: str | int) -> np.ndarray:
             return read_hdf5(group, "/".join(f"_index_{key}" if isinstance(key, int) else key for key in path), where)
@@ -276,9 +276,9 @@ def _arrow_reader(data_format: str, folder: Path, source: str) -> Callable[[int]
     pyarrow = import_pyarrow(source)
 
     def episode(index: int) -> _Episode:
-        files = pyarrow.dataset.dataset(
-            folder / str(index), format=data_format, ignore_prefixes=["_", ".", METADATA_FILE_NAME]
-        )
+        paths = files_below(folder, str(index))
+        found = [str(path) for path in paths if not path.name.startswith(("_", ".", METADATA_FILE_NAME))]
+        files = pyarrow.dataset.dataset(found, format=data_format)
         missing = sorted(set(EPISODE_KEYS) - set(files.schema.names))
         if missing:
             raise DatasetError(f"{source}, episode {index}: holds no {', '.join(missing)}; the file is incomplete.")

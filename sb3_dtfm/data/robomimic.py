@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, existing_file
-from sb3_dtfm.data.hdf5 import listed, open_group, open_hdf5, read_hdf5
+from sb3_dtfm.data.hdf5 import check_within, listed, open_group, open_hdf5, read_hdf5
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_finite, check_flags, wrap_dataset_errors
 from sb3_dtfm.envs.robosuite import env_id_from_robomimic
@@ -160,9 +160,10 @@ def _number(name: str) -> tuple[int, str]:
 
 
 def _filtered(file: h5py.File, source: str, filter_key: str, demos: list[str]) -> list[str]:
-    masks = file.get("mask", {})
-    if filter_key not in masks:
+    masks = open_group(file, "mask", source) if "mask" in set(file) else {}
+    if filter_key not in set(masks):
         raise DatasetError(f"{source}: has no filter key {filter_key!r}; available: {listed(masks)}.")
+    check_within(masks, filter_key, f"{source}: mask")
     chosen = np.asarray(masks[filter_key][()]).reshape(-1).tolist()
     names = [name.decode() if isinstance(name, bytes) else str(name) for name in chosen]
     missing = sorted(set(names) - set(demos), key=_number)

@@ -3,9 +3,11 @@
 import itertools
 import json
 import math
+import os
 import shutil
 import warnings
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -222,6 +224,50 @@ def unwritten(file: h5py.File, path: str, folder: Path) -> None:
     replace(file, path, lambda array: file.create_dataset(path, array.shape, array.dtype))
 
 
+def pipe(folder: Path) -> str:
+    """What nobody writes to, so that whoever opens it waits for ever."""
+    os.mkfifo(folder / "pipe")
+    return str(folder / "pipe")
+
+
+def link_through_pipe(file: h5py.File, path: str, folder: Path) -> None:
+    del file[path]
+    file["/elsewhere"] = h5py.ExternalLink(pipe(folder), "/")
+    file[path] = h5py.SoftLink("/elsewhere/array")
+
+
+def virtual_over_pipe(file: h5py.File, path: str, folder: Path) -> None:
+    """Of as many rows as the other file has."""
+    array = file[path][()]
+    del file[path]
+    shapes = dict(shape=array.shape, maxshape=(None, *array.shape[1:]))
+    layout, everything = h5py.VirtualLayout(dtype=array.dtype, **shapes), slice(0, h5py.h5s.UNLIMITED)
+    layout[everything] = h5py.VirtualSource(str(folder / "pipe"), "array", dtype=array.dtype, **shapes)[everything]
+    file.create_virtual_dataset(path, layout)
+    file.flush()
+    pipe(folder)
+
+
+def some_chunks(file: h5py.File, path: str, folder: Path) -> None:
+    array = file[path][()]
+    del file[path]
+    data = file.create_dataset(path, array.shape, array.dtype, chunks=(2, *array.shape[1:]), fillvalue=0)
+    data[:4] = array[:4]
+
+
+def short_chunk(compression: str | None) -> Callable[[h5py.File, str, Path], object]:
+    """One chunk has a byte of its many."""
+
+    def change(file: h5py.File, path: str, folder: Path) -> None:
+        array = file[path][()]
+        del file[path]
+        chunks = (2, *array.shape[1:])
+        data = file.create_dataset(path, data=array, chunks=chunks, compression=compression)
+        data.id.write_direct_chunk((0,) * array.ndim, zlib.compress(b"1") if compression else b"1")
+
+    return change
+
+
 def linked(file: h5py.File, path: str, folder: Path) -> None:
     file.move(path, "/elsewhere")
     file[path] = h5py.SoftLink("/elsewhere")
@@ -235,6 +281,12 @@ HDF5: dict[str, tuple[Callable[[h5py.File, str, Path], object], str | None]] = {
     "link to another file": (put(lambda folder, array: h5py.ExternalLink(str(folder / "other.hdf5"), "array")), None),
     "link to no file": (put(lambda folder, array: h5py.ExternalLink("/none.hdf5", "array")), None),
     "link to a device": (put(lambda folder, array: h5py.ExternalLink("/dev/zero", "array")), None),
+    "link to a pipe": (put(lambda folder, array: h5py.ExternalLink(pipe(folder), "array")), None),
+    "link through a pipe": (link_through_pipe, None),
+    "virtual over a pipe": (virtual_over_pipe, None),
+    "some chunks unwritten": (some_chunks, None),
+    "a short chunk": (short_chunk(None), None),
+    "a short compressed chunk": (short_chunk("gzip"), None),
     "storage in another file": (external_storage, None),
     "virtual": (virtual, None),
     "unwritten": (unwritten, None),
@@ -716,6 +768,7 @@ def group_cases() -> Iterator[Case]:  # noqa: C901 (a list)
 
     for kind, path, name in (("hdf5", "episode_1", "main_data"), ("robomimic", "data/demo_1", "set.hdf5")):
         yield case(kind, "an episode in another file", path, away, name, path[-6:])
+        yield case(kind, "an episode behind a pipe", path, link_through_pipe, name, path[-6:])
         yield case(kind, "an episode that links into nothing", path, link(h5py.SoftLink("/nowhere")), name, path[-6:])
         yield case(kind, "an episode that links to itself", path, link_to_itself, name, path[-6:])
         yield case(
@@ -729,6 +782,7 @@ def group_cases() -> Iterator[Case]:  # noqa: C901 (a list)
     yield case("hdf5", "an episode of another name", "episode_1", move("/episode_one"), "main_data", "episode_1")
     yield case("hdf5", "no episode", "episode_0", lambda f, p, folder: f.clear(), "total_episodes", "0")
     yield case("robomimic", "no demonstration", "data", lambda f, p, folder: f[p].clear(), "set.hdf5", "no demonstration")
+    yield case("robomimic", "a mask behind a pipe", "mask/train", link_through_pipe, SAME)
     yield case("robomimic", "no data", "data", lambda f, p, folder: f.__delitem__(p), "set.hdf5", "data")
     yield case("robomimic", "an array for data", "data", link(np.zeros(3)), "set.hdf5", "data")
     yield case("robomimic", "data in another file", "data", away, "set.hdf5", "data")

@@ -126,3 +126,10 @@ def test_damaged_files(tmp_path):
     file.unlink()
     with pytest.raises(DatasetError, match=r"arm: there is no parquet file below data"):
         load_dataset(path)
+
+
+def test_a_link_out_of_the_folder_is_refused(tmp_path):
+    path = write(tmp_path / "arm")
+    (tmp_path / "arm" / "data" / "x").symlink_to("/")
+    with pytest.raises(DatasetError, match=r"data/x leads to /; links within .*arm are accepted"):
+        load_dataset(path)

@@ -199,7 +199,9 @@ def test_zeroed_bytes_in_the_file_are_found():
 def test_missing_or_broken_metadata_is_named(content: str | None, datasets_path: Path):
     metadata = data_file(write([make_episode(3)]), "metadata.json")
     metadata.unlink() if content is None else metadata.write_text(content)
-    with pytest.raises(DatasetError, match=r"test/set-v0.*(damaged or incomplete|dataset_id is None)") as caught:
+    with pytest.raises(
+        DatasetError, match=r"test/set-v0.*(does not exist|damaged or incomplete|dataset_id is None)"
+    ) as caught:
         load_minari("test/set-v0")
     assert str(datasets_path) in str(caught.value)
 
