@@ -6,6 +6,7 @@ import zlib
 import h5py
 import numpy as np
 
+from sb3_dtfm.data.observations import STORED_AS_JPEG
 from sb3_dtfm.data.trajectories import DatasetError, check_real, check_size, wrap_dataset_errors
 
 # Links one after the other that are followed at most, which is HDF5's own limit.
@@ -47,6 +48,8 @@ def open_hdf5(group: h5py.Group, name: str, where: str) -> tuple[h5py.h5d.Datase
         if not _stored_within(data):  # what is there can change without a trace, or be what nobody meant to give away
             raise DatasetError(f"{what} lie in another file; one file that holds everything is accepted.")
         shape, dtype, n_stored = data.shape, data.dtype, data.get_storage_size()
+    if h5py.check_vlen_dtype(dtype) == np.uint8:
+        raise DatasetError(f"{what} {STORED_AS_JPEG}")
     check_real(dtype, what)
     if not shape:
         raise DatasetError(f"{what} have shape {shape}; one entry for each step is expected.")

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import math
+import os
 import reprlib
 import warnings
 from collections.abc import Callable
@@ -13,6 +14,7 @@ import h5py
 import minari
 import numpy as np
 from gymnasium import spaces
+from minari.dataset._storages import get_minari_storage
 from minari.dataset.minari_dataset import parse_dataset_id
 from minari.serialization import deserialize_space
 from minari.storage import get_dataset_path
@@ -36,7 +38,7 @@ INFOS = "infos"
 FIELDS: dict[str, tuple[tuple[type, ...], bool]] = {
     "dataset_id": ((str,), True),
     "minari_version": ((str,), True),
-    "data_format": ((str,), True),
+    "data_format": ((str,), False),
     "total_episodes": ((int,), True),
     "total_steps": ((int,), True),
     "observation_space": ((str,), True),
@@ -46,6 +48,8 @@ FIELDS: dict[str, tuple[tuple[type, ...], bool]] = {
     "ref_min_score": ((int, float), False),
     "ref_max_score": ((int, float), False),
 }
+# Seconds in which a server has to answer.
+REACHED_AFTER = 10.0
 FORMATS = ("hdf5", "arrow", "parquet")
 # Entries of the vector that a step's observation, or action, becomes: no task has as many.
 MOST_ENTRIES = 2**20
@@ -141,13 +145,22 @@ def open_minari(dataset_id: str) -> minari.MinariDataset:
     folder = get_dataset_path(dataset_id) / "data"
     if not folder.exists():
         _download(dataset_id)
-    read_metadata(folder, dataset_id)
-    with wrap_dataset_errors(f"Minari dataset {dataset_id} ({folder / METADATA_FILE_NAME})"):
-        return minari.load_dataset(dataset_id)
+    metadata = read_metadata(folder, dataset_id)
+    source = f"Minari dataset {dataset_id} ({folder / METADATA_FILE_NAME})"
+    if metadata["minari_version"] not in minari.supported_dataset_versions:
+        raise DatasetError(
+            f"{source}: was written by Minari {metadata['minari_version']!r:.20}, which the installed Minari "
+            f"{minari.__version__} does not read: pip install --upgrade minari."
+        )
+    with wrap_dataset_errors(source):
+        space, action_space = (deserialize_space(metadata[name]) for name in ("observation_space", "action_space"))
+        return minari.MinariDataset(get_minari_storage(metadata["data_format"])(folder, space, action_space))
 
 
 def _download(dataset_id: str) -> None:
     try:
+        if os.getenv("MINARI_REMOTE", "hf://").startswith("hf://"):
+            _reach_hub()
         minari.download_dataset(dataset_id)
     except Exception as error:  # whatever the remote's client raises
         with warnings.catch_warnings():
@@ -158,6 +171,14 @@ def _download(dataset_id: str) -> None:
             f"Minari dataset {dataset_id} is not in {get_dataset_path()} (set by MINARI_DATASETS_PATH), which holds "
             f"{', '.join(local) if local else 'no dataset'}; and it cannot be downloaded: {why}"
         ) from error
+
+
+def _reach_hub() -> None:
+    """Fail at once where there is no way to Hugging Face's hub, which its client would look for again and again."""
+    from huggingface_hub.constants import ENDPOINT
+    from huggingface_hub.utils import get_session
+
+    get_session().head(ENDPOINT, timeout=REACHED_AFTER)
 
 
 def read_metadata(folder: Path, dataset_id: str) -> dict[str, Any]:
@@ -202,6 +223,7 @@ def _check_fields(metadata: dict[str, Any], source: str) -> None:
             raise DatasetError(f"{source}: {name} is {reprlib.repr(value)}; expected is one of type {expected}.")
         if isinstance(value, int | float) and not (math.isfinite(value) and (value >= 0 or name.startswith("ref"))):
             raise DatasetError(f"{source}: {name} is {value}; a number is expected, and a count of at least 0.")
+    metadata.setdefault("data_format", FORMATS[0])  # which the first versions did not name, since there was no other
     if metadata["data_format"] not in FORMATS:
         found = f"data_format is {reprlib.repr(metadata['data_format'])}"
         raise DatasetError(f"{source}: {found}; accepted are {', '.join(FORMATS)}.")

@@ -10,8 +10,16 @@ from gymnasium import spaces
 
 from sb3_dtfm.data.trajectories import DatasetError, check_real
 
+# How a JPEG image begins.
+JPEG = b"\xff\xd8\xff"
 # Gives one of an episode's arrays by its name, followed by the keys of the parts of a Dict or Tuple that lead to it.
 ReadArray: TypeAlias = Callable[..., np.ndarray]
+
+
+STORED_AS_JPEG = (
+    "hold JPEG images, as which Minari stores arrays of bytes; images cannot be used, and vectors are read if they are "
+    "recorded as another type than uint8."
+)
 
 
 def as_vectors(observations: Any, where: str) -> np.ndarray:
@@ -69,6 +77,8 @@ def flatten_observations(read: ReadArray, path: tuple[str | int, ...], space: sp
     values, name = read(*path), "/".join(map(str, path))
     check_real(values.dtype, f"{where}: {name}")
     size = math.prod(space.shape or ())
+    if values.dtype == np.uint8 and values.ndim == 2 and values[:1, :3].tobytes() == JPEG and size != values.shape[1]:
+        raise DatasetError(f"{where}: {name} {STORED_AS_JPEG}")
     if values.shape[1:] not in (space.shape, (size,)):
         raise DatasetError(
             f"{where}: {name} have shape {values.shape}, expected (steps, {', '.join(map(str, space.shape or ()))})."
