@@ -12,7 +12,7 @@ from sb3_dtfm.envs.robosuite.tasks import TASKS
 ROBOSUITE_TYPE = 1  # robomimic's number for robosuite's environments
 ROBOTS = ("Panda", ["Panda"])
 # What an action does in our environments: robosuite's names of it, and what it is called in robosuite <= 1.4.
-CONTROLLER = {
+CONTROLLER: dict[str, Any] = {
     "type": "OSC_POSE",
     "output_min": [-0.05] * 3 + [-0.5] * 3,
     "output_max": [0.05] * 3 + [0.5] * 3,
@@ -89,12 +89,9 @@ def differences_from_robomimic(env_args: str | dict[str, Any]) -> dict[str, tupl
         differences["control_freq"] = kwargs["control_freq"], CONTROL_FREQUENCY
     arm = arm_controller(kwargs)
     for name, ours in CONTROLLER.items():
-        theirs = arm.get(name, arm.get(OLD_NAMES.get(name), ours))
-        if type(ours) in (int, list) and theirs is not None:
-            same = np.allclose(theirs, ours)  # one number for all six dimensions, or one for each
-        else:
-            same = theirs == ours
-        if not same:
+        theirs = arm.get(name, arm.get(OLD_NAMES.get(name, name), ours))
+        numbers = type(ours) in (int, list) and theirs is not None  # one for all six dimensions, or one for each
+        if not (np.allclose(theirs, ours) if numbers else theirs == ours):
             differences[name] = theirs, ours
     return differences
 

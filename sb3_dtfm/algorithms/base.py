@@ -46,7 +46,14 @@ from sb3_dtfm.data import (
 from sb3_dtfm.data.decisions import Decision, decide
 from sb3_dtfm.data.inspection import return_reference, suggested_target_return
 from sb3_dtfm.distributed import check_batch_size, is_first_process, local_rank_zero_first
-from sb3_dtfm.envs import ReturnToGoWrapper, check_vec_env, known_task, return_to_go_space, share_target_return
+from sb3_dtfm.envs import (
+    ReturnToGoWrapper,
+    check_vec_env,
+    known_task,
+    recorded_space,
+    return_to_go_space,
+    share_target_return,
+)
 from sb3_dtfm.files import ModelFile, file_name, holds_pickles, read_model, write_model, write_onnx
 from sb3_dtfm.optimization import LEARNING_RATE_SCHEDULES, PRECISIONS, RunningMeans
 from sb3_dtfm.policies import SequencePolicy
@@ -296,6 +303,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         if self.env is not None and (task := known_task(self.env)) is not None:
             self.time_limit = task.max_episode_steps
         known = {"action_space": getattr(self, "action_space", None), "max_episode_steps": self.time_limit}
+        known["observation_space"] = None if self.env is None else recorded_space(self.env)
         with local_rank_zero_first():
             buffer = load_dataset(self.dataset, **{**known, **(self.dataset_kwargs or {})})
         observation_space = return_to_go_space(buffer.observation_space)

@@ -106,7 +106,7 @@ def _check_chunks(data: h5py.h5d.DatasetID, shape: tuple[int, ...], what: str) -
     n_chunks = math.prod(-(-length // of_chunk) for length, of_chunk in zip(shape, chunk, strict=True))
     filters = [layout.get_filter(number)[0] for number in range(layout.get_nfilters())]
     n_found = data.get_num_chunks()
-    if n_found < n_chunks or not filters and data.get_storage_size() < n_chunks * n_bytes:
+    if n_found < n_chunks or (not filters and data.get_storage_size() < n_chunks * n_bytes):
         raise DatasetError(
             f"{what} have shape {shape}, {n_chunks} chunks of {n_bytes} bytes; {n_found} chunks of "
             f"{data.get_storage_size()} bytes in all are there: the file is incomplete."

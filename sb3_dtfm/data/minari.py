@@ -6,7 +6,8 @@ import math
 import os
 import reprlib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,11 +23,12 @@ from minari.storage import get_dataset_path
 from sb3_dtfm.data.arrow import import_pyarrow
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, existing_file, files_below
+from sb3_dtfm.data.flat import fitted
 from sb3_dtfm.data.hdf5 import open_group, read_hdf5
-from sb3_dtfm.data.observations import ReadArray, flatten_observations
+from sb3_dtfm.data.observations import ReadArray, chosen_space, flatten_chosen
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, check_flags, wrap_dataset_errors
-from sb3_dtfm.envs.return_to_go import flatten_observation_space, sort_observation_space
+from sb3_dtfm.envs.return_to_go import flatten_observation_space
 from sb3_dtfm.envs.success import SUCCESS
 
 METADATA_FILE_NAME, HDF5_FILE_NAME = "metadata.json", "main_data.hdf5"
@@ -84,7 +86,11 @@ def _is_whole(dataset: minari.MinariDataset) -> bool:
 
 
 def load_minari(
-    dataset: str | minari.MinariDataset, on_invalid: str = "raise", storage: FileStorage | None = None
+    dataset: str | minari.MinariDataset,
+    observation_keys: Sequence[str] | None = None,
+    clip_actions: bool = False,
+    on_invalid: str = "raise",
+    storage: FileStorage | None = None,
 ) -> TrajectoryBuffer:
     """
     Read a Minari dataset: a local one, else one that Minari's own client downloads.
@@ -92,6 +98,8 @@ def load_minari(
     Nothing that its metadata name is imported, built or run: of `env_spec` only the id is read.
 
     :param dataset: id (`namespace/name-vN`) or an opened dataset, whose choice of episodes is kept
+    :param observation_keys: which entries of dictionary observations make up the observation, in this order
+    :param clip_actions: bring actions outside of the dataset's action space to the nearest bound
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
     :param storage: where the steps go, memory if not given
     :return: its episodes, with the normalised-score scale of its metadata where it names one
@@ -107,18 +115,19 @@ def load_minari(
         raise DatasetError(f"{source}: holds no episode; at least one is needed.")
     with contextlib.ExitStack() as stack, wrap_dataset_errors(source):
         env_spec = dataset.env_spec
-        observation_space = _flat(dataset.observation_space, source)
+        observation_space, action_space = _space(dataset.observation_space, observation_keys, source), dataset.action_space
         read = _hdf5_reader(stack, folder, source) if in_hdf5 else _arrow_reader(dataset.storage.FORMAT, folder, source)
 
         def trajectory(index: int) -> Trajectory:
             name = f"episode {index}"
             with wrap_dataset_errors(f"{source}, {name}"):
-                return make_trajectory(*read(index), dataset.observation_space, name, source)
+                found = make_trajectory(*read(index), observation_keys, observation_space, name, source)
+                return replace(found, actions=fitted(found.actions, action_space, clip_actions))
 
         buffer = TrajectoryBuffer.from_trajectories(
             map(trajectory, dataset.episode_indices.tolist()),
-            dataset.action_space,
-            observation_space,
+            action_space,
+            flatten_observation_space(observation_space),
             n_steps=dataset.total_steps,
             source=source,
             score_reference=_score_reference(metadata),
@@ -248,9 +257,11 @@ def _n_episodes(folder: Path, data_format: str, dataset_id: str) -> int:
             return sum(name.startswith("episode_") for name in file)
 
 
-def _flat(space: spaces.Space, source: str) -> spaces.Box:
+def _space(space: spaces.Space, keys: Sequence[str] | None, source: str) -> spaces.Space:
     try:
-        return flatten_observation_space(space)
+        return chosen_space(space, keys, source)
+    except DatasetError:
+        raise
     except ValueError as error:
         raise DatasetError(f"{source}: {error}") from error
 
@@ -330,7 +341,12 @@ def _arrow_reader(data_format: str, folder: Path, source: str) -> Callable[[int]
 
 
 def make_trajectory(
-    read: ReadArray, success: np.ndarray | None, observation_space: spaces.Space, name: str, source: str
+    read: ReadArray,
+    success: np.ndarray | None,
+    observation_keys: Sequence[str] | None,
+    observation_space: spaces.Space,
+    name: str,
+    source: str,
 ) -> Trajectory:
     """
     One episode of a Minari file.
@@ -339,7 +355,8 @@ def make_trajectory(
         by its keys
     :param success: flags of the steps, whose last one tells of the episode, after one of its reset or not; None where
         nothing is told
-    :param observation_space: the dataset's own
+    :param observation_keys: as for :func:`load_minari`
+    :param observation_space: of what is chosen of the dataset's, sorted
     :param name: what the file calls the episode
     :param source: the file, for messages
     :raises DatasetError: one of its arrays is missing, or they differ in length
@@ -349,7 +366,7 @@ def make_trajectory(
     n_steps = len(rewards)
     if len(actions) != n_steps:
         raise DatasetError(f"{where}: holds {len(actions)} actions for {n_steps} rewards; as many are expected.")
-    columns = flatten_observations(read, ("observations",), sort_observation_space(observation_space), where)
+    columns = flatten_chosen(read, observation_keys, observation_space, where)
     counts = sorted({len(column) for column in columns})
     if len(counts) != 1 or counts[0] - n_steps not in (0, 1):
         raise DatasetError(

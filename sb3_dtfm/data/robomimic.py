@@ -1,9 +1,11 @@
 """Reading robomimic's hdf5 files into a `TrajectoryBuffer`."""
 
+import contextlib
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import h5py
@@ -12,7 +14,7 @@ from gymnasium import spaces
 
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, existing_file
-from sb3_dtfm.data.flat import fitted
+from sb3_dtfm.data.flat import fitted, warn_of_made_up_rewards
 from sb3_dtfm.data.hdf5 import check_within, listed, open_group, open_hdf5, read_hdf5
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_finite, check_flags, wrap_dataset_errors
@@ -39,10 +41,24 @@ def fingerprint_robomimic(path: str | os.PathLike[str], options: dict[str, Any])
 
     :param path: the file
     :param options: of :func:`load_robomimic`
-    :raises DatasetError: no such file
+    :raises DatasetError: no such file, or one of another robot or controller, see :func:`load_robomimic`
     """
+    options = dict(options)
+    meant_for = options.pop("env_id", None)  # which a cache does not hold
+    with _opened(path) as (file, source):
+        if "data" in set(file):
+            _env_id(_env_args(open_group(file, "data", source), source), source, meant_for)
+    return Fingerprint.of(Path(source).name, Path(source), options)
+
+
+@contextlib.contextmanager
+def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[h5py.File, str]]:
+    """While it is read, and what it is called."""
     path = existing_file(path, EXPECTED)
-    return Fingerprint.of(path.name, path, options)
+    if not h5py.is_hdf5(path):
+        raise DatasetError(f"{path}: not an hdf5 file; a robomimic hdf5 file is expected.")
+    with wrap_dataset_errors(str(path)), h5py.File(path, "r") as file:
+        yield file, str(path)
 
 
 def load_robomimic(
@@ -79,12 +95,8 @@ def load_robomimic(
     :raises DatasetError: no such file, not readable, nothing in it, unknown keys, wrong shapes, NaN or infinity, or actions
         out of range; names the file, the demonstration and the step
     """
-    path = existing_file(path, EXPECTED)
-    source = str(path)
-    if not h5py.is_hdf5(path):
-        raise DatasetError(f"{source}: not an hdf5 file; a robomimic hdf5 file is expected.")
-    with wrap_dataset_errors(source), h5py.File(path, "r") as file:
-        keys = tuple(observation_keys or DEFAULT_OBSERVATION_KEYS)
+    keys = tuple(observation_keys or DEFAULT_OBSERVATION_KEYS)
+    with _opened(path) as (file, source):
         return _read(file, source, filter_key, keys, clip_actions, env_id, on_invalid, storage)
 
 
@@ -125,7 +137,9 @@ def _read(
     if not refused:
         _check_count(data, "total", sum(demo.n_steps for demo in labels.values()), source)
     rewards = _rewards(labels)
-    env_id = env_id or _env_id(env_args, source)
+    if not any(demo.rewards is not None and demo.rewards.any() for demo in labels.values()):
+        warn_of_made_up_rewards((), source)
+    env_id = _env_id(env_args, source, env_id)
     n_actions = next((labels[name].n_actions for name in demos if name in labels), None)
     if n_actions is None:
         raise refused[demos[0]]
@@ -189,16 +203,16 @@ def _env_args(data: h5py.Group, source: str) -> dict[str, Any]:
     return env_args if isinstance(env_args, dict) else {}
 
 
-def _env_id(env_args: dict[str, Any], source: str) -> str | None:
-    """Our environment of the file's task, whose actions have to move the arm as the file's do."""
+def _env_id(env_args: dict[str, Any], source: str, meant_for: str | None) -> str | None:
+    """Our environment of the file's task; if none is named that the file is meant for, its actions have to do the same."""
     with wrap_dataset_errors(f"{source}: attribute 'env_args' of group 'data'"):
         env_id = env_id_from_robomimic(env_args)
         differences = {} if env_id is None else differences_from_robomimic(env_args)
-    if differences:
+    if differences and meant_for is None:
         found = ", ".join(f"{name} is {theirs!r} instead of {ours!r}" for name, (theirs, ours) in differences.items())
         raise DatasetError(
-            f"{source}: an action does something else than in {env_id}: {found}. For an environment with these settings "
-            f"(sb3_dtfm.envs.robosuite.env_kwargs_from_robomimic) say so with dataset_kwargs={{'env_id': ...}}, naming its id."
+            f"{source}: an action does something else than in {env_id}: {found}. For an environment with these "
+            "settings (sb3_dtfm.envs.robosuite.env_kwargs_from_robomimic) give its id, dataset_kwargs={'env_id': ...}."
         )
     return env_id
 

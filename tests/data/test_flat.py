@@ -90,7 +90,10 @@ REFUSED = {
         dict(actions=None),
         "has no array one of actions, action, acts, only episode_ends, observations, rewards",
     ),
-    "no ends": (dict(episode_ends=None), "does not say where episodes end; one of episode_ends, episode_lengths, term"),
+    "no ends": (
+        dict(episode_ends=None),
+        "does not say where episodes end; one of episode_ends, episode_lengths, episode, term",
+    ),
     "ends before the end": (dict(episode_ends=[2, 5]), "episode_ends tells of 5 steps in all; actions have 9"),
     "an empty episode": (dict(episode_ends=[2, 2, 9]), "episode_ends tells of 0 steps in episode 1"),
     "no episode": (dict(episode_ends=np.zeros(0, int)), "episode_ends tells of 0 steps in all"),
@@ -100,7 +103,10 @@ REFUSED = {
     "flat actions": (dict(actions=np.zeros(N)), r"actions have shape \(9,\); \(N, A\) is expected"),
     "words": (dict(rewards=np.array(["good"] * N)), "rewards hold <U4; real numbers are expected"),
     "two rewards": (dict(rewards=np.zeros((N, 2))), "rewards have 2 columns"),
-    "pickles": (dict(rewards=np.array([print] * N)), "rewards hold object; real numbers"),
+    "pickles": (
+        dict(rewards=np.array([print] * N)),
+        "rewards holds Python objects as a pickle, which can run code .* allow_pickle=True",
+    ),
 }
 
 

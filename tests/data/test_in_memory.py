@@ -148,7 +148,7 @@ def test_an_unfit_episode_can_be_dropped_and_actions_clipped():
 def test_rewards_that_are_made_up_although_something_was_there_are_told_of():
     episode = {"obs": np.zeros((3, 2)), "acts": ACTS, "rew": np.zeros(3), "done": np.zeros(3)}
     for given in ([episode], {**episode, "episode_lengths": [3]}):
-        with pytest.warns(UserWarning, match=r"none of rewards, reward, rews, so that success is .* Not read: done, rew\."):
+        with pytest.warns(UserWarning, match=r"none of rewards, reward, rews, nor any success, so .* Not read: rew\."):
             assert load_dataset(given).episode_returns.tolist() == [1.0]
 
 

@@ -169,8 +169,8 @@ def test_anything_else_is_refused_with_what_is_accepted(dataset: Any):
 def test_an_unknown_option_is_refused_with_those_there_are(robomimic_file: Path, minari_dataset: minari.MinariDataset):
     with pytest.raises(
         TypeError,
-        match=r"unknown option filter \(did you mean filter_key\?\); accepted: filter_key, observation_keys, on_invalid",
+        match=r"unknown option filter \(did you mean filter_key\?\); accepted: filter_key, observation_keys, clip_act",
     ):
         load_dataset(robomimic_file, filter="train")
-    with pytest.raises(TypeError, match="test/ones-v0: unknown option filter_key; accepted: on_invalid, cache_dir, env_id"):
+    with pytest.raises(TypeError, match="test/ones-v0: unknown option filter_key; accepted: observation_keys, clip_act"):
         load_dataset("test/ones-v0", filter_key="train")
