@@ -60,7 +60,8 @@ class Arrays(ABC):
                 return name
         accepted = names[0] if len(names) == 1 else f"one of {', '.join(names)}"
         found = ", ".join(sorted(map(str, self.names))) or "nothing"
-        raise DatasetError(f"{self.source}: has no array {accepted}, only {found}.")
+        cure = " Name the columns with observation_keys=[...] and action_keys=[...]." if self.are_columns else ""
+        raise DatasetError(f"{self.source}: has no array {accepted}, only {found}.{cure}")
 
     def columns(self, names: Sequence[str]) -> list[str]:
         """The columns of a table that begin with the first of the names that any begins with: `obs_0`, `obs.x`, `obs[0]`."""

@@ -452,8 +452,8 @@ def explain_range(space: ActionSpace, bounds: Sequence[Any] | None, environment:
         if bounds is not None or space is environment:
             raise
         raise ActionRangeError(
-            f"{error} This range is assumed, since nobody tells of another: give the environment, or its smallest and largest "
-            "action as action_bounds=(-2, 2), or clip_actions=True."
+            f"{error} This range is assumed, since nobody tells of another. Give an environment (inspect: --env ID), or "
+            "action_bounds=(smallest, largest), or clip_actions=True."
         ) from error
 
 

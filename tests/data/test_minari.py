@@ -328,3 +328,25 @@ def test_a_hub_that_cannot_be_reached_fails_at_once(monkeypatch: pytest.MonkeyPa
     with pytest.raises(DatasetError, match=r"test/none-v0 is not in .*; and it cannot be downloaded: .*refused"):
         load_minari("test/none-v0")
     assert time.monotonic() - begin < 5.0
+
+
+def test_entries_of_dictionary_observations_are_chosen():
+    space = spaces.Dict({"b": spaces.Box(-9, 9, (2,)), "a": spaces.Discrete(3), "c": spaces.Box(-9, 9, (1,))})
+    seen = {"a": np.array([0, 2, 1, 0]), "b": np.zeros((4, 2), np.float32), "c": np.full((4, 1), 5.0, np.float32)}
+    for data_format in ("hdf5", "parquet"):
+        dataset_id = f"test/{data_format}-v0"
+        episode = make_episode(3, observations=seen)
+        write([episode], dataset_id, observation_space=space, data_format=data_format)
+        np.testing.assert_array_equal(
+            load_minari(dataset_id, observation_keys=["c", "a"]).observations, [[5, 1, 0, 0], [5, 0, 0, 1], [5, 0, 1, 0]]
+        )
+        with pytest.raises(DatasetError, match=r"observation_keys is \['d'\]; the observations have entries a, b, c"):
+            load_minari(dataset_id, observation_keys=["d"])
+    write([make_episode(3)])
+    with pytest.raises(DatasetError, match=r"observation_keys is \['d'\]; the observations have no entries, but Box"):
+        load_minari("test/set-v0", observation_keys=["d"])
+
+
+def test_actions_outside_of_the_space_can_be_clipped():
+    write([make_episode(5, actions=np.full((5, 2), 0.9, np.float32))])
+    assert load_minari("test/set-v0", clip_actions=True).actions.unique().tolist() == [np.float32(0.4)]
