@@ -42,6 +42,7 @@ from sb3_dtfm.data import (
     TrajectoryBuffer,
     check_action_space,
     load_dataset,
+    without_pickles,
 )
 from sb3_dtfm.data.decisions import Decision, decide
 from sb3_dtfm.data.inspection import return_reference, suggested_target_return
@@ -305,7 +306,7 @@ class OfflineAlgorithm(BaseAlgorithm, ABC):
         known = {"action_space": getattr(self, "action_space", None), "max_episode_steps": self.time_limit}
         known["observation_space"] = None if self.env is None else recorded_space(self.env)
         with local_rank_zero_first():
-            buffer = load_dataset(self.dataset, **{**known, **(self.dataset_kwargs or {})})
+            buffer = load_dataset(self.dataset, **{**known, **without_pickles(self.dataset_kwargs)})
         observation_space = return_to_go_space(buffer.observation_space)
         if getattr(self, "observation_space", None) is None:
             self.observation_space, self.action_space, self.n_envs = observation_space, buffer.action_space, 1

@@ -22,6 +22,10 @@ from sb3_dtfm.data.trajectories import DatasetError, check_real, check_size, wra
 
 NPZ_SUFFIX, CSV_SUFFIX, PARQUET_SUFFIX = ".npz", ".csv", ".parquet"
 EXPECTED = "the path of a file of flat arrays (.npz, .hdf5) or of a table (.csv, .parquet)"
+PICKLE = (
+    "a pickle of Python objects, which can run code when it is read. From people you trust, "
+    "dataset=load_dataset(path, allow_pickle=True) reads it all the same."
+)
 # Of what is no file.
 NUMBERS_EXPECTED = "arrays of numbers are expected"
 # The name of what TrajectoryBuffer.save writes of the environment.
@@ -102,10 +106,7 @@ class _Npz(Arrays):
     def _get(self, name: str, where: str) -> np.ndarray:
         dtype = self._header(name, where)
         if dtype.hasobject:
-            raise DatasetError(
-                f"{where} holds Python objects as a pickle, which can run code when it is read; allow_pickle=True "
-                "(in dataset_kwargs) reads it all the same, from people you trust."
-            )
+            raise DatasetError(f"{where} is {PICKLE}")
         check_real(dtype, where)
         return self._stored(name)
 

@@ -74,7 +74,9 @@ def check_within(group: h5py.Group, name: str, where: str) -> None:
     """
     with wrap_dataset_errors(f"{where}: {name}"):
         if not _leads_within(group.id, name.encode()):
-            raise DatasetError(f"{where}: {name!r} lies in another file; one file that holds everything is accepted.")
+            raise DatasetError(
+                f"{where}: {name!r} lies in another file, or behind links without end; one file that holds all is accepted."
+            )
 
 
 def _leads_within(group: h5py.h5g.GroupID, path: bytes, n_links: int = 0) -> bool:

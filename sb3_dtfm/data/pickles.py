@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_dtfm.data.arrays import NPZ_SUFFIX
+from sb3_dtfm.data.arrays import NPZ_SUFFIX, PICKLE
 from sb3_dtfm.data.cache import existing_file
 from sb3_dtfm.data.flat import ACTIONS
 from sb3_dtfm.data.trajectories import DatasetError, wrap_dataset_errors
@@ -29,10 +29,7 @@ def unpickled(dataset: Any, allow_pickle: bool) -> Any:
         if name.endswith(SUFFIXES):
             path = existing_file(dataset, "the path of a pickle, such as SB3's replay buffer")
             if not allow_pickle:
-                raise DatasetError(
-                    f"{path} is a pickle, which can run code when it is read; allow_pickle=True (in dataset_kwargs) reads "
-                    "it all the same, from people you trust."
-                )
+                raise DatasetError(f"{path} is {PICKLE}")
             with wrap_dataset_errors(str(path)), open(path, "rb") as file:
                 dataset = pickle.load(file)
         elif allow_pickle and name.endswith(NPZ_SUFFIX):
@@ -54,3 +51,18 @@ def _as_episodes(arrays: Mapping[str, Any]) -> Any:
         return arrays
     columns = {name: array for name, array in arrays.items() if len(np.atleast_1d(array)) == len(actions)}
     return [{name: array[number] for name, array in columns.items()} for number in range(len(actions))]
+
+
+def without_pickles(options: Mapping[str, Any] | None) -> dict[str, Any]:
+    """
+    Options of :func:`~sb3_dtfm.data.load_dataset` that a model, settings or a run folder hold, which may be of others.
+
+    :param options: by name; None for none
+    :raises DatasetError: they allow pickles, which only a call of `load_dataset` does
+    """
+    if "allow_pickle" in (options or {}):
+        raise DatasetError(
+            "dataset_kwargs: allow_pickle is accepted by load_dataset alone: "
+            "dataset=load_dataset('buffer.pkl', allow_pickle=True), or .save('mine.npz') for the command line."
+        )
+    return dict(options or {})

@@ -27,7 +27,7 @@ from sb3_dtfm.data.in_memory import (
 )
 from sb3_dtfm.data.lerobot import fingerprint_lerobot, is_lerobot, load_lerobot
 from sb3_dtfm.data.minari import fingerprint_minari, is_minari, load_minari
-from sb3_dtfm.data.pickles import unpickled
+from sb3_dtfm.data.pickles import unpickled, without_pickles
 from sb3_dtfm.data.robomimic import fingerprint_robomimic, is_robomimic, load_robomimic
 from sb3_dtfm.data.trajectories import DatasetError
 
@@ -99,7 +99,7 @@ def load_several(
     """
     buffers, weights = [], []
     for each in datasets:
-        options = dict(each) if is_mapping(each) else {"dataset": each}
+        options = without_pickles(each) if is_mapping(each) else {"dataset": each}
         dataset, weight = options.pop("dataset"), options.pop("weight", 1.0)
         if not POSITIVE.accepts(weight):
             raise DatasetError(f"dataset {dataset!s}: weight is {weight!r}; a positive number is accepted.")
@@ -164,7 +164,7 @@ def load_dataset(
     :param success_only: keep the successes alone, by what the data say of each episode's last step; see
         :attr:`TrajectoryBuffer.successes`
     :param allow_pickle: read pickles, which can run code: files of SB3's replay buffers (`.pkl`), and arrays of objects in
-        `.npz`
+        `.npz`; not accepted from `dataset_kwargs`, which files of others may hold
     :param kwargs: options of the reader: `on_invalid`, which is "raise" unless "drop" leaves episodes out that would be
         refused, with a warning that names their number and the first reason; `filter_key` and `observation_keys` for
         robomimic files, see also :func:`load_flat`

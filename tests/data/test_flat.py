@@ -155,7 +155,7 @@ REFUSED = {
     "two rewards": (dict(rewards=np.zeros((N, 2))), "rewards have 2 columns"),
     "pickles": (
         dict(rewards=np.array([print] * N)),
-        "rewards holds Python objects as a pickle, which can run code .* allow_pickle=True",
+        "rewards is a pickle of Python objects, which can run code .* allow_pickle=True",
     ),
 }
 

@@ -9,6 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.save_util import save_to_pkl
 
+from sb3_dtfm import DT
 from sb3_dtfm.data import DatasetError, load_dataset
 
 LENGTHS = (3, 5)
@@ -46,7 +47,9 @@ def test_a_pickle_runs_nothing_unless_it_is_allowed(suffix, tmp_path):
     else:
         path.write_bytes(pickle.dumps(Planted(tmp_path / "mark")))
     for options in ({}, {"allow_pickle": False}):
-        with pytest.raises(DatasetError, match=f"set{suffix}.* pickle, which can run code .*allow_pickle=True"):
+        with pytest.raises(
+            DatasetError, match=f"set{suffix}.* a pickle of Python objects, which can run code .*allow_pickle=True"
+        ):
             load_dataset(path, **options)
     assert not (tmp_path / "mark").exists()
 
@@ -76,3 +79,15 @@ def test_a_damaged_pickle_is_named(tmp_path):
     (tmp_path / "set.pkl").write_bytes(b"no pickle")
     with pytest.raises(DatasetError, match=r"set.pkl: cannot be read"):
         load_dataset(tmp_path / "set.pkl", allow_pickle=True)
+
+
+def test_what_files_of_others_may_hold_allows_no_pickle(tmp_path):
+    (tmp_path / "set.pkl").write_bytes(pickle.dumps(Planted(tmp_path / "mark")))
+    allowed = {"allow_pickle": True}
+    for dataset, options in (
+        (tmp_path / "set.pkl", {"dataset_kwargs": allowed}),
+        ([{"dataset": str(tmp_path / "set.pkl"), **allowed}], {}),
+    ):
+        with pytest.raises(DatasetError, match="dataset_kwargs: allow_pickle is accepted by load_dataset alone"):
+            DT("MultiInputPolicy", dataset=dataset, device="cpu", **options)
+    assert not (tmp_path / "mark").exists()
