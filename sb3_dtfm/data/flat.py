@@ -200,7 +200,7 @@ def _read(
     if not has_rewards:
         done = stops[successes != 0.0] - 1
         rewards[done] = 1.0
-        terminated[done] = True
+        terminated[done], truncated[done] = True, False
     if action_bounds is None and arrays.has((LOW,)):
         action_bounds = arrays.read((LOW,)), arrays.read((HIGH,))
     space = bounded_space(action_bounds, action_space, actions, source)
@@ -282,7 +282,7 @@ def _ends(arrays: Arrays, n_steps: int, max_episode_steps: int | None) -> _Ends:
             stops = np.append(stops, n_steps)
         if not arrays.has((*TRUNCATIONS, *DONES)):
             stops = _cut(stops, max_episode_steps, arrays)
-    if max_episode_steps is not None and arrays.has((*TERMINATIONS, *DONES)) and not arrays.has(TRUNCATIONS):
+    if max_episode_steps is not None and not arrays.has(TRUNCATIONS):
         late = stops[np.diff(stops, prepend=0) == max_episode_steps] - 1
         terminated[late] &= arrays.has(TERMINATIONS)
         truncated[late] = ~terminated[late]

@@ -132,7 +132,9 @@ def _named(step: Sequence[Any]) -> dict[str, Any]:
     parts = _parts(step)
     names: tuple[str, ...] = SHORT_STEP
     if len(parts) == len(STEP):
-        followed = not isinstance(step[3], bool | np.bool_) and np.shape(step[2]) == np.shape(step[0])
+        # Of observations that are numbers, only the types tell a reward and a flag from two flags.
+        told_apart = np.ndim(step[0]) > 0 or type(step[3]) is not type(step[4])
+        followed = np.shape(step[2]) == np.shape(step[0]) and not isinstance(step[3], bool | np.bool_) and told_apart
         names = SB3_STEP if followed or isinstance(step[2], Mapping) else STEP
     found = {name: part for name, part in zip(names, parts, strict=True) if name != "next_observation"}
     return {**found, **({INFO[0]: infos[0]} if infos else {})}

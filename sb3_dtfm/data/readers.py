@@ -181,7 +181,7 @@ def load_dataset(
     accepted = [*own, *(["cache_dir"] if reader.fingerprint else []), *COMMON_OPTIONS]
     unknown = sorted(set(given) - set(accepted))
     if unknown:
-        name = reader.kind if is_mapping(dataset) or is_episodes(dataset) else str(dataset)
+        name = reader.kind if is_mapping(dataset) or is_episodes(dataset) or is_table(dataset) else str(dataset)
         raise TypeError(
             f"dataset {name}: unknown option {with_nearest(unknown, accepted)}; accepted: {', '.join(accepted)}."
         )

@@ -84,6 +84,8 @@ def test_a_number_that_comes_again_is_no_episode(path):
 def test_of_dones_those_at_the_time_limit_are_truncated(path):
     buffer = load_dataset(write(path, episode_ends=None, dones=flags(1, 4, 8)), max_episode_steps=4)
     assert (buffer.terminated.tolist(), buffer.truncated.tolist()) == ([True, True, False], [False, False, True])
+    buffer = load_dataset(write(path, rewards=np.ones(N)), max_episode_steps=4)
+    assert (buffer.terminated.tolist(), buffer.truncated.tolist()) == ([False] * 3, [False, False, True])
 
 
 def test_terminals_alone_do_not_tell_of_timeouts(path):

@@ -214,6 +214,20 @@ def test_steps_without_an_array_or_an_end_are_named():
     assert load_dataset(numbered).episode_lengths.tolist() == [4, 4, 3]
 
 
+NUMBERS = {
+    "SB3": [(t, 1, t + 1, float(t), t == 3) for t in range(4)],
+    "SB3, whole rewards": [(t, 1, t + 1, t, t == 3) for t in range(4)],
+    "Gymnasium": [(t, 1, float(t), t == 3, False) for t in range(4)],
+    "Gymnasium, whole flags": [(t, 1, float(t), int(t == 3), 0) for t in range(4)],
+}
+
+
+@pytest.mark.parametrize("kind", NUMBERS)
+def test_a_next_observation_that_is_a_number_is_no_reward(kind):
+    buffer = load_dataset(NUMBERS[kind], action_space=spaces.Discrete(2))
+    assert (buffer.rewards.tolist(), buffer.terminated.tolist()) == ([0, 1, 2, 3], [True])
+
+
 def test_infos_tell_of_the_time_limit():
     late = {"TimeLimit.truncated": True}
     steps = [(OBS[0], ACTS[0], 1.0, t % 2 == 1, late if t == 3 else {}) for t in range(6)]
