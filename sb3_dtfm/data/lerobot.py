@@ -142,7 +142,8 @@ def load_lerobot(
 def _info(folder: Path, source: str) -> tuple[dict[str, tuple[int, ...]], dict[str, int]]:
     """Shapes of the features that are numbers, and how many frames and episodes there should be."""
     with wrap_dataset_errors(f"{source}: {INFO}"):
-        info = json.loads((folder / INFO).read_text())
+        (path,) = (path for path in files_below(folder, "meta") if path == folder / INFO)
+        info = json.loads(path.read_text())
         version = info.get("codebase_version")
         if not re.fullmatch(r"v[23]\.\d+", str(version)):
             raise DatasetError(f"{source}: {INFO}: codebase_version is {version!r:.20}; formats v2.0 to v3.0 are read.")

@@ -211,7 +211,8 @@ def _check_options(given: dict[str, Any]) -> None:
     check_arguments(given, {name: rule for name, rule in ACCEPTED.items() if name in given})
     for name in ("cache_dir", "env_id"):
         value = given[name]
-        if value is not None and not (isinstance(value, str | os.PathLike) and str(value)):
+        kinds = str if name == "env_id" else (str, os.PathLike)
+        if value is not None and not (isinstance(value, kinds) and str(value)):
             expected = "the path of a folder" if name == "cache_dir" else "the id of an environment"
             raise ValueError(f"{name} must be {expected}, or None, got {value!r}.")
     for name in ("observation_keys", "action_keys"):

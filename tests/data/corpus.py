@@ -99,6 +99,20 @@ def write_good(folder: Path, monkeypatch: Any) -> None:
         for name, array in flat_arrays().items():
             file[name] = array
     write_lerobot(folder / "lerobot" / "arm")
+    for kind in ("csv", "table"):
+        (folder / kind).mkdir()
+    columns = table_columns()
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    lines = [",".join(columns), *(",".join(map(repr, row)) for row in rows)]
+    (folder / "csv" / "set.csv").write_text("\n".join(lines))
+    pyarrow.parquet.write_table(pa.table(columns), folder / "table" / "set.parquet")
+
+
+def table_columns() -> dict[str, np.ndarray]:
+    arrays = flat_arrays()
+    columns = {f"obs_{i}": column for i, column in enumerate(arrays["observations"].T)}
+    columns |= {f"action_{i}": column for i, column in enumerate(arrays["actions"].T)}
+    return {**columns, "reward": arrays["rewards"], "episode": np.repeat(np.arange(len(LENGTHS)), LENGTHS)}
 
 
 def write_lerobot(folder: Path) -> None:

@@ -148,6 +148,11 @@ def test_a_link_out_of_the_folder_is_refused(tmp_path):
     (tmp_path / "arm" / "data" / "x").symlink_to("/")
     with pytest.raises(DatasetError, match=r"data/x leads to /; links within .*arm are accepted"):
         load_dataset(path)
+    info = tmp_path / "arm" / "meta" / "info.json"
+    info.rename(tmp_path / "other.json")
+    info.symlink_to(tmp_path / "other.json")
+    with pytest.raises(DatasetError, match=r"info.json leads to .*other.json; links within .*arm are accepted"):
+        load_dataset(path)
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
