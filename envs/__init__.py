@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         check_vec_env,
         flatten_observation_space,
         known_task,
+        recorded_space,
         return_to_go_space,
         share_target_return,
     )
@@ -30,6 +31,7 @@ __all__ = [
     "check_vec_env",
     "flatten_observation_space",
     "known_task",
+    "recorded_space",
     "register_gymnasium_robotics",
     "register_robosuite_envs",
     "return_to_go_space",

@@ -143,6 +143,11 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """What Gymnasium knows of it, in words that pass between processes, where the whole `spec` may not."""
         return None if self.spec is None else Task(self.spec.id, self.spec.max_episode_steps)
 
+    @property
+    def recorded_space(self) -> spaces.Space:
+        """What the environment itself observes, with sorted keys."""
+        return self._sorted_space
+
     def set_target_return(self, target_return: float) -> None:
         """
         Ask for another return from the next reset on; also through ``VecEnv.env_method("set_target_return", value)``.
@@ -236,6 +241,12 @@ def known_task(env: VecEnv) -> Task | None:
     """What Gymnasium knows of the task behind a :class:`ReturnToGoWrapper`; None of one that is not registered."""
     (task,) = env.get_attr("known_task", indices=0)
     return task
+
+
+def recorded_space(env: VecEnv) -> spaces.Space:
+    """Observation space of the environment behind a :class:`ReturnToGoWrapper`, as its observations are recorded."""
+    (space,) = env.get_attr("recorded_space", indices=0)
+    return space
 
 
 def share_target_return(env: VecEnv, target_return: float | None) -> float | None:

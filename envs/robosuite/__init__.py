@@ -2,6 +2,8 @@
 
 from sb3_dtfm.envs.robosuite.env import RobosuiteEnv
 from sb3_dtfm.envs.robosuite.registration import (
+    arm_controller,
+    differences_from_robomimic,
     env_id_from_robomimic,
     env_kwargs_from_robomimic,
     register_robosuite_envs,
@@ -12,6 +14,8 @@ __all__ = [
     "TASKS",
     "RobosuiteEnv",
     "RobosuiteTask",
+    "arm_controller",
+    "differences_from_robomimic",
     "env_id_from_robomimic",
     "env_kwargs_from_robomimic",
     "register_robosuite_envs",

@@ -4,11 +4,27 @@ import json
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 
 from sb3_dtfm.envs.robosuite.scene import CONTROL_FREQUENCY
 from sb3_dtfm.envs.robosuite.tasks import TASKS
 
 ROBOSUITE_TYPE = 1  # robomimic's number for robosuite's environments
+ROBOTS = ("Panda", ["Panda"])
+# What an action does in our environments: robosuite's names of it, and what it is called in robosuite <= 1.4.
+CONTROLLER: dict[str, Any] = {
+    "type": "OSC_POSE",
+    "output_min": [-0.05] * 3 + [-0.5] * 3,
+    "output_max": [0.05] * 3 + [0.5] * 3,
+    "kp": 150,
+    "damping_ratio": 1,
+    "impedance_mode": "fixed",
+    "position_limits": None,
+    "orientation_limits": None,
+    "uncouple_pos_ori": True,
+    "interpolation": None,
+}
+OLD_NAMES = {"damping_ratio": "damping"}
 
 
 def register_robosuite_envs() -> None:
@@ -47,7 +63,7 @@ def env_kwargs_from_robomimic(env_args: str | dict[str, Any]) -> dict[str, Any]:
         supported = ", ".join(repr(row.environment) for row in TASKS.values())
         raise ValueError(f"env_name is {arguments.get('env_name')!r}; supported are {supported}.")
     robots = kwargs.get("robots", "Panda")
-    if robots not in ("Panda", ["Panda"]):
+    if robots not in ROBOTS:
         raise ValueError(f"robots is {robots!r}; only a single 'Panda' is supported.")
     frequency = kwargs.get("control_freq", CONTROL_FREQUENCY)
     if frequency != CONTROL_FREQUENCY:
@@ -56,6 +72,40 @@ def env_kwargs_from_robomimic(env_args: str | dict[str, Any]) -> dict[str, Any]:
     if isinstance(config, list):
         config = config[0]
     return {"task": task, "controller_config": config, "lite_physics": kwargs.get("lite_physics", True)}
+
+
+def differences_from_robomimic(env_args: str | dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """
+    How actions of a robomimic file move another arm, or the arm otherwise, than in a registered environment of ours.
+
+    :param env_args: as for :func:`env_id_from_robomimic`
+    :return: by the name of each field that differs, its value in the file and ours; a field that is missing does not differ
+    """
+    kwargs = _parsed(env_args)[1].get("env_kwargs", {})
+    differences: dict[str, tuple[Any, Any]] = {}
+    if kwargs.get("robots", "Panda") not in ROBOTS:
+        differences["robots"] = kwargs["robots"], "Panda"
+    if kwargs.get("control_freq", CONTROL_FREQUENCY) != CONTROL_FREQUENCY:
+        differences["control_freq"] = kwargs["control_freq"], CONTROL_FREQUENCY
+    arm = arm_controller(kwargs)
+    for name, ours in CONTROLLER.items():
+        theirs = arm.get(name, arm.get(OLD_NAMES.get(name, name), ours))
+        numbers = type(ours) in (int, list) and theirs is not None  # one for all six dimensions, or one for each
+        if not (np.allclose(theirs, ours) if numbers else theirs == ours):
+            differences[name] = theirs, ours
+    return differences
+
+
+def arm_controller(env_kwargs: dict[str, Any]) -> dict[str, Any]:
+    """
+    The settings of the arm's controller.
+
+    :param env_kwargs: of a robomimic file's `env_args`
+    :return: those of robosuite 1.5, or of robosuite <= 1.4; empty where the file has none
+    """
+    config = env_kwargs.get("controller_configs") or {}
+    config = config[0] if isinstance(config, list) else config
+    return dict(config.get("body_parts", {}).get("right", config))
 
 
 def _parsed(env_args: str | dict[str, Any]) -> tuple[str | None, dict[str, Any]]:

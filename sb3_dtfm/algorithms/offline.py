@@ -33,6 +33,7 @@ from sb3_dtfm.data import (
     ScoreReference,
     TrajectoryBuffer,
     load_dataset,
+    without_pickles,
 )
 from sb3_dtfm.data.decisions import Decision, decide_open, sentences
 from sb3_dtfm.data.inspection import return_reference, suggested_target_return
@@ -264,8 +265,9 @@ class OfflineAlgorithm(SequenceModel):
         if self.env is not None and (task := known_task(self.env)) is not None:
             self.time_limit = task.max_episode_steps
         known = {"action_space": getattr(self, "action_space", None), "max_episode_steps": self.time_limit}
+        known["observation_space"] = None if self.env is None else recorded_space(self.env)
         with local_rank_zero_first():
-            buffer = load_dataset(self.dataset, **{**known, **(self.dataset_kwargs or {})})
+            buffer = load_dataset(self.dataset, **{**known, **without_pickles(self.dataset_kwargs)})
         observation_space = return_to_go_space(buffer.observation_space)
         if getattr(self, "observation_space", None) is None:
             self.observation_space, self.action_space, self.n_envs = observation_space, buffer.action_space, 1

@@ -16,7 +16,7 @@ import numpy as np
 import torch as th
 
 import sb3_dtfm
-from sb3_dtfm.data import TrajectoryBuffer, load_dataset
+from sb3_dtfm.data import TrajectoryBuffer, load_dataset, without_pickles
 from sb3_dtfm.data.inspection import BEST_SHARE, return_reference
 from sb3_dtfm.data.minari import is_minari, open_minari
 from sb3_dtfm.optimization import multiplies_bfloat16
@@ -86,7 +86,7 @@ def read_data(env_id: str, settings: dict[str, Any]) -> TrajectoryBuffer:
     with contextlib.closing(gym.make(env_id, **(settings.get("env_kwargs") or {}))) as env:
         limit = None if env.spec is None else env.spec.max_episode_steps
         known = {"action_space": env.action_space, "max_episode_steps": limit}
-    buffer = load_dataset(settings["dataset"], **{**known, **(settings.get("dataset_kwargs") or {})})
+    buffer = load_dataset(settings["dataset"], **{**known, **without_pickles(settings.get("dataset_kwargs"))})
     buffer.check_task(env_id)
     return buffer
 

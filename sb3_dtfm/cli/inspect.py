@@ -10,18 +10,20 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_dtfm.actions import ActionSpace
+from sb3_dtfm.actions import ActionSpace, same_actions
 from sb3_dtfm.cli.literals import key_value
-from sb3_dtfm.data import TrajectoryBuffer, load_dataset
+from sb3_dtfm.data import DatasetError, TrajectoryBuffer, check_action_space, load_dataset
 from sb3_dtfm.data.decisions import decide, sentences
 from sb3_dtfm.data.inspection import Inspection, Range, inspect_buffer
-from sb3_dtfm.envs import register_gymnasium_robotics
+from sb3_dtfm.envs import flatten_observation_space, register_gymnasium_robotics
 
 BLUE, RED, GREY = "#1b6ca8", "#c0562b", "0.6"
 # Options that choose among episodes by what they come to.
 CHOOSING = {"min_return", "best_share", "success_only"}
 # Discrete actions that are counted in the table, the most frequent ones.
 N_CHOICES = 10
+# Dimensions of the observations that have a row each.
+N_DIMENSIONS = 24
 # Episodes whose rewards are drawn.
 N_DRAWN = 50
 
@@ -34,32 +36,56 @@ def main(argv: Sequence[str]) -> None:
     """
     options = _parser().parse_args(argv)
     dataset = options.dataset[0] if len(options.dataset) == 1 else options.dataset
-    buffer = load(dataset, dict(options.dataset_kwargs))
+    buffer = load(dataset, dict(options.dataset_kwargs), options.env)
     found = inspect_buffer(buffer)
-    print("\n".join(table(buffer, found)))
+    print("\n".join([*table(buffer, found), *dimensions(found.observations)]))
     for remark in found.remarks:
         print(f"- {remark}")
     print("\nDecided from the data, unless you say otherwise:")
     for sentence in sentences(decide(buffer)):
         print(f"- {sentence}")
+    print(f"\nTo load it in Python:\n  {loading(dataset, dict(options.dataset_kwargs), options.env)}")
     print(f"\nTo begin with:\n  {command(options.dataset, options.dataset_kwargs, buffer, found)}")
     print(f"\nPicture: {draw(buffer, found, Path(options.output), ' + '.join(options.dataset))}")
 
 
-def load(dataset: str | list[str], options: dict[str, Any]) -> TrajectoryBuffer:
+def load(dataset: str | list[str], options: dict[str, Any], env_id: str | None = None) -> TrajectoryBuffer:
     """
     A dataset as its task would learn from it: up to the time limit, where the task is known here, and the best of that.
 
     :param dataset: Minari id, file, or several of them
     :param options: of its reader
+    :param env_id: Gymnasium id of the task; None leaves it to the dataset
+    :raises DatasetError: the dataset cannot be read, or is not of this task
     """
-    buffer = load_dataset(dataset, **{name: value for name, value in options.items() if name not in CHOOSING})
     register_gymnasium_robotics()
+    if env_id is not None:
+        return _load_for(env_id, dataset, options)
+    buffer = load_dataset(dataset, **{name: value for name, value in options.items() if name not in CHOOSING})
     spec = gym.registry.get(buffer.env_id or "")
     limit = None if spec is None else spec.max_episode_steps
     if limit is not None and buffer.episode_lengths.max() > limit:
         return load_dataset(dataset, **{"max_episode_steps": limit, **options})
     return load_dataset(dataset, **options) if CHOOSING & options.keys() else buffer
+
+
+def _load_for(env_id: str, dataset: str | list[str], options: dict[str, Any]) -> TrajectoryBuffer:
+    env = gym.make(env_id)
+    observed, action_space = env.observation_space, env.action_space
+    limit = None if env.spec is None else env.spec.max_episode_steps
+    env.close()
+    known = {"action_space": action_space, "observation_space": observed, "max_episode_steps": limit}
+    buffer = load_dataset(dataset, **{**known, **options})
+    buffer.check_task(env_id)
+    flat = flatten_observation_space(observed)
+    fits = same_actions(check_action_space(action_space, env_id), buffer.action_space)
+    if flat.shape != buffer.observation_space.shape or not fits:
+        held = f"{buffer.observation_space.shape} and actions of {buffer.action_space}"
+        raise DatasetError(
+            f"{buffer.source} holds observations of shape {held}; those of {env_id} are {flat.shape} and {action_space}."
+        )
+    buffer.env_id = env_id
+    return buffer
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -68,7 +94,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Show what is in a dataset, what may be wrong with it, and a return to ask for.",
     )
     argument = parser.add_argument
-    argument("dataset", nargs="+", metavar="DATASET", help="Minari id, robomimic file or flat arrays; or several")
+    argument("dataset", nargs="+", metavar="DATASET", help="Minari id, file or folder; or several")
     argument(
         "--dataset-kwargs",
         nargs="+",
@@ -77,6 +103,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="KEY:VALUE",
         help="options of its reader, as for train",
     )
+    argument("--env", metavar="ID", help="environment to learn it for; by default what the dataset names")
     argument("-o", "--output", default="dataset.png", metavar="FILE", help="PNG to write; dataset.png by default")
     return parser
 
@@ -103,6 +130,35 @@ def table(buffer: TrajectoryBuffer, found: Inspection) -> list[str]:
         "actions": _actions(buffer, found),
     }
     return [f"| {buffer.source} | |", "| --- | --- |", *(f"| {name} | {what} |" for name, what in rows.items())]
+
+
+def dimensions(found: Range) -> list[str]:
+    """
+    :param found: in the observations
+    :return: lines of Markdown, one for each of the first dimensions
+    """
+    rows = zip(found.low[:N_DIMENSIONS], found.high, found.mean, found.std, strict=False)
+    lines = [
+        f"| observation {number} | {low:.4g} to {high:.4g}, {mean:.4g} on average, standard deviation {std:.4g} |"
+        for number, (low, high, mean, std) in enumerate(rows)
+    ]
+    n_more = len(found.low) - N_DIMENSIONS
+    return [*lines, f"| {n_more} observations more | |"] if n_more > 0 else lines
+
+
+def loading(dataset: str | list[str], options: dict[str, Any], env_id: str | None) -> str:
+    """
+    :param dataset: as for :func:`load`
+    :param options: as for :func:`load`
+    :param env_id: as for :func:`load`
+    :return: Python that reads the dataset
+    """
+    given = [f"{name}={value!r}" for name, value in options.items()]
+    known = []
+    if env_id is not None:
+        limit = gym.spec(env_id).max_episode_steps
+        known = [f"action_space=gymnasium.make({env_id!r}).action_space", f"max_episode_steps={limit}"]
+    return f"sb3_dtfm.data.load_dataset({', '.join([repr(dataset), *known, *given])})"
 
 
 def _actions(buffer: TrajectoryBuffer, found: Inspection) -> str:

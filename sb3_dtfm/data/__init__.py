@@ -3,9 +3,10 @@
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.episodes import Statistics
 from sb3_dtfm.data.flat import load_flat
-from sb3_dtfm.data.in_memory import load_episodes, load_replay_buffer
+from sb3_dtfm.data.in_memory import load_episodes, load_replay_buffer, load_steps
 from sb3_dtfm.data.lerobot import load_lerobot
 from sb3_dtfm.data.minari import load_minari
+from sb3_dtfm.data.pickles import without_pickles
 from sb3_dtfm.data.readers import Dataset, load_dataset
 from sb3_dtfm.data.robomimic import load_robomimic
 from sb3_dtfm.data.trajectories import (
@@ -33,5 +34,7 @@ __all__ = [
     "load_minari",
     "load_replay_buffer",
     "load_robomimic",
+    "load_steps",
     "returns_to_go",
+    "without_pickles",
 ]

@@ -1,23 +1,31 @@
 """Arrays by their names, of an `.npz` file, an hdf5 file, or memory: looked at before they are read, never executed."""
 
 import contextlib
+import csv
 import math
 import os
+import re
 import zipfile
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
+from sb3_dtfm.data.arrow import as_numbers, import_pyarrow
 from sb3_dtfm.data.cache import existing_file
-from sb3_dtfm.data.hdf5 import read_hdf5
+from sb3_dtfm.data.hdf5 import check_within, read_hdf5
 from sb3_dtfm.data.observations import as_vectors
 from sb3_dtfm.data.trajectories import DatasetError, check_real, check_size, wrap_dataset_errors
 
-NPZ_SUFFIX = ".npz"
-EXPECTED = "the path of a file of flat arrays (.npz, .hdf5)"
+NPZ_SUFFIX, CSV_SUFFIX, PARQUET_SUFFIX = ".npz", ".csv", ".parquet"
+EXPECTED = "the path of a file of flat arrays (.npz, .hdf5) or of a table (.csv, .parquet)"
+PICKLE = (
+    "a pickle of Python objects, which can run code when it is read. From people you trust, "
+    "dataset=load_dataset(path, allow_pickle=True) reads it all the same."
+)
 # Of what is no file.
 NUMBERS_EXPECTED = "arrays of numbers are expected"
 # The name of what TrajectoryBuffer.save writes of the environment.
@@ -32,6 +40,9 @@ class Arrays(ABC):
     :param names: of all that are there
     :param n_stored: bytes of the file, None in memory
     """
+
+    # Whether each is a column of a table, (N,), several of which make up an observation.
+    are_columns = False
 
     def __init__(self, source: str, names: Collection[str], n_stored: int | None = None) -> None:
         self.source = source
@@ -53,14 +64,27 @@ class Arrays(ABC):
                 return name
         accepted = names[0] if len(names) == 1 else f"one of {', '.join(names)}"
         found = ", ".join(sorted(map(str, self.names))) or "nothing"
-        raise DatasetError(f"{self.source}: has no array {accepted}, only {found}.")
+        cure = " Name the columns with observation_keys=[...] and action_keys=[...]." if self.are_columns else ""
+        raise DatasetError(f"{self.source}: has no array {accepted}, only {found}.{cure}")
+
+    def columns(self, names: Sequence[str]) -> list[str]:
+        """The columns of a table that begin with the first of the names that any begins with: `obs_0`, `obs.x`, `obs[0]`."""
+        if self.are_columns and not self.has(names):
+            for name in names:
+                if found := [each for each in self.names if re.match(rf"{name}[\W_\d]", each)]:
+                    return found
+        return [self.name(names)]
+
+    def stored(self, name: str) -> Any:
+        """An array as it is, for those who look at it themselves."""
+        where = f"{self.source}: {name}"
+        with wrap_dataset_errors(where):
+            return self._get(name, where)
 
     def read(self, names: Sequence[str], n_steps: int | None = None) -> np.ndarray:
         """The first of the named arrays that is there: numbers, one entry a step."""
         name = self.name(names)
-        where = f"{self.source}: {name}"
-        with wrap_dataset_errors(where):
-            array = self._get(name, where)
+        where, array = f"{self.source}: {name}", np.asarray(self.stored(name))
         check_real(array.dtype, where)
         if n_steps is not None and array.shape[:1] != (n_steps,):
             raise DatasetError(f"{where} has shape {array.shape} and actions have {n_steps} steps.")
@@ -80,7 +104,10 @@ class _Npz(Arrays):
         super().__init__(source, self._members, os.path.getsize(source))
 
     def _get(self, name: str, where: str) -> np.ndarray:
-        check_real(self._header(name, where), where)
+        dtype = self._header(name, where)
+        if dtype.hasobject:
+            raise DatasetError(f"{where} is {PICKLE}")
+        check_real(dtype, where)
         return self._stored(name)
 
     def env_id(self) -> str | None:
@@ -117,6 +144,7 @@ class _Hdf5(Arrays):
     """Of an opened file, at its top."""
 
     def __init__(self, file: h5py.File, source: str) -> None:
+        check_within(file, "infos", source)
         infos = file.get("infos")
         within = {f"infos/{name}" for name in infos} if isinstance(infos, h5py.Group) else set()
         super().__init__(source, {*file, *within}, os.path.getsize(source))
@@ -133,27 +161,108 @@ class _InMemory(Arrays):
         super().__init__("arrays", arrays)
         self._arrays = arrays
 
-    def _get(self, name: str, where: str) -> np.ndarray:
+    def _get(self, name: str, where: str) -> Any:
         found = self._arrays[name]
         with wrap_dataset_errors(where, NUMBERS_EXPECTED):
-            return as_vectors(found, where) if isinstance(found, Mapping) else np.asarray(found)
+            return found if isinstance(found, Mapping) else np.asarray(found)
+
+    def read(self, names: Sequence[str], n_steps: int | None = None) -> np.ndarray:
+        name = self.name(names)
+        if isinstance(self._arrays[name], Mapping):
+            return as_vectors(self._arrays[name], f"{self.source}: {name}")
+        return super().read(names, n_steps)
+
+
+class _Table(Arrays):
+    """Of a DataFrame's columns, whose entries are numbers, or arrays of one length."""
+
+    are_columns = True
+
+    def __init__(self, table: Any, source: str, n_stored: int | None = None) -> None:
+        super().__init__(source, [str(name) for name in table], n_stored)
+        self._columns = {str(name): table[name] for name in table}
+
+    def _get(self, name: str, where: str) -> Any:
+        column = self._columns[name]
+        array = np.asarray(column.to_numpy() if hasattr(column, "to_numpy") else column)
+        nested = array.dtype == object and array.size > 0 and isinstance(array[0], np.ndarray | list | tuple)
+        with wrap_dataset_errors(where, NUMBERS_EXPECTED):
+            return np.stack(list(array)) if nested else array
+
+
+class _Parquet(Arrays):
+    """Of an opened Parquet file."""
+
+    are_columns = True
+
+    def __init__(self, file: Any, source: str) -> None:
+        super().__init__(source, file.schema_arrow.names, os.path.getsize(source))
+        groups = [file.metadata.row_group(number) for number in range(file.metadata.num_row_groups)]
+        n_numbers = sum(group.column(i).num_values for group in groups for i in range(group.num_columns))
+        check_size(8 * n_numbers, self.n_stored or 0, f"{source}: {file.metadata.num_rows} rows")
+        self._file = file
+
+    def _get(self, name: str, where: str) -> Any:
+        table = self._file.read(columns=[name])
+        table.validate(full=True)
+        column = table[name].combine_chunks()
+        if import_pyarrow(where).types.is_nested(column.type):
+            return as_numbers(column, where)
+        return column.to_numpy(zero_copy_only=False)
+
+
+def is_table(dataset: Any) -> bool:
+    """Whether this is a DataFrame, of pandas or of another package."""
+    return hasattr(dataset, "columns") and hasattr(dataset, "to_numpy") and hasattr(dataset, "__getitem__")
+
+
+def _read_csv(path: Path) -> dict[str, np.ndarray]:
+    """The columns of a CSV file by the names in its first line; numbers where all entries of a column are some."""
+    with open(path, newline="", encoding="utf-8-sig") as file:
+        rows = csv.reader(file, strict=True)
+        names = [name.strip() for name in next(rows, [])]
+        lines = [row for row in rows if row]
+    for number, row in enumerate(lines, 2):
+        if len(row) != len(names):
+            raise DatasetError(f"{path}, row {number}: has {len(row)} entries, and the first row names {len(names)}.")
+    if len(set(names)) < len(names):
+        raise DatasetError(f"{path}: the first row is {', '.join(names)}; a name for each column is expected, each once.")
+    return {name: _parsed(column) for name, column in zip(names, zip(*lines, strict=True), strict=True)} if lines else {}
+
+
+def _parsed(column: Sequence[str]) -> np.ndarray:
+    words = [word.strip() for word in column]
+    if {word.lower() for word in words} <= {"true", "false"}:
+        return np.array([word.lower() == "true" for word in words])
+    with contextlib.suppress(ValueError, OverflowError):
+        return np.array([int(word) for word in words], np.int64)
+    with contextlib.suppress(ValueError):
+        return np.array([float(word or "nan") for word in words])
+    return np.array(words, dtype=object)
 
 
 @contextlib.contextmanager
-def opened(dataset: str | os.PathLike[str] | Mapping[str, Any]) -> Iterator[Arrays]:
+def opened(dataset: Any) -> Iterator[Arrays]:
     """
     While they are read.
 
-    :param dataset: path of the file, or arrays by name
+    :param dataset: path of the file, arrays by name, or a DataFrame
     :raises DatasetError: no such file, or a damaged one
     """
     if isinstance(dataset, Mapping):
         yield _InMemory(dataset)
+        return
+    if is_table(dataset):
+        yield _Table(dataset, "table")
         return
     path = existing_file(dataset, EXPECTED)
     source = str(path)
     with wrap_dataset_errors(source), contextlib.ExitStack() as stack:
         if path.name.endswith(NPZ_SUFFIX):
             yield _Npz(stack.enter_context(zipfile.ZipFile(path)), source)
+        elif path.name.endswith(CSV_SUFFIX):
+            yield _Table(_read_csv(path), source, path.stat().st_size)
+        elif path.name.endswith(PARQUET_SUFFIX):
+            yield _Parquet(stack.enter_context(import_pyarrow(source).parquet.ParquetFile(path)), source)
         else:
             yield _Hdf5(stack.enter_context(h5py.File(path, "r")), source)

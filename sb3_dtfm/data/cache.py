@@ -45,20 +45,38 @@ def existing_file(path: str | os.PathLike[str], expected: str) -> Path:
     """
     path = Path(path).expanduser()
     if not path.is_file():
-        problem = "is a folder" if path.is_dir() else "does not exist"
+        problem = "is a folder" if path.is_dir() else "is no regular file" if path.exists() else "does not exist"
         raise DatasetError(f"{path.absolute()} {problem}; {expected} is expected.")
     return path
 
 
-def files_below(folder: Path) -> list[Path]:
-    """All files in a folder and below it, behind linked folders, too, sorted."""
-    files, seen = [], set()
-    for parent, folders, names in os.walk(folder, followlinks=True):
-        if (real := os.path.realpath(parent)) in seen:  # a link leads back
+def files_below(folder: Path, part: str = "") -> list[Path]:
+    """
+    All files in a part of a folder and below it, behind links within the folder, too, sorted.
+
+    :param folder: of a dataset; a snapshot of Hugging Face's hub may link to the hub's `blobs`
+    :param part: what to look through, the whole folder if not given
+    :raises DatasetError: a link leads out of the folder, to anything on this machine
+    """
+    root, files, seen = folder.resolve(), [], set()
+    within = [root, *(parent.parents[1] / "blobs" for parent in (root, *root.parents) if parent.parent.name == "snapshots")]
+
+    def check(path: Path) -> str:
+        real = os.path.realpath(path)
+        if not any(Path(real).is_relative_to(one) for one in within):
+            raise DatasetError(f"{path} leads to {real}; links within {folder} are accepted.")
+        return real
+
+    check(folder / part)
+    for parent, folders, names in os.walk(folder / part, followlinks=True):
+        if (real := check(Path(parent))) in seen:  # a link leads back
             folders.clear()
             continue
         seen.add(real)
         files += [Path(parent, name) for name in names]
+    for file in files:
+        if file.is_symlink():
+            check(file)
     return sorted(file for file in files if file.is_file())
 
 

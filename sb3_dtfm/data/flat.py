@@ -4,22 +4,22 @@ import contextlib
 import itertools
 import os
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
 from gymnasium import spaces
 
 from sb3_dtfm.actions import ActionSpace, bounds_of, choices_between
-from sb3_dtfm.data.arrays import ENV_ID, EXPECTED, NPZ_SUFFIX, Arrays, opened
+from sb3_dtfm.data.arrays import CSV_SUFFIX, ENV_ID, EXPECTED, NPZ_SUFFIX, PARQUET_SUFFIX, Arrays, opened
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, existing_file
-from sb3_dtfm.data.observations import check_no_images
+from sb3_dtfm.data.observations import chosen, in_space, part_of
 from sb3_dtfm.data.short_episodes import ShortEpisodes, blocks
 from sb3_dtfm.data.storage import FileStorage
-from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_flags
+from sb3_dtfm.data.trajectories import ActionRangeError, DatasetError, Trajectory, check_flags
 from sb3_dtfm.envs.success import SUCCESS
 
 # What others call the same array: the first that is there is read.
@@ -28,43 +28,52 @@ ACTIONS = ("actions", "action", "acts")
 REWARDS = ("rewards", "reward", "rews")
 ENDS, LENGTHS = "episode_ends", "episode_lengths"
 TERMINATIONS = ("terminations", "terminals", "terminated", "terminal")
-TRUNCATIONS = ("truncations", "timeouts", "truncated")
+TRUNCATIONS = ("truncations", "timeouts", "truncated", "timeout")
+# Ends of either kind, as SB3 has them.
+DONES = ("dones", "done")
+# The number, or the name, of each step's episode.
+EPISODES = ("episode", "episode_id", "episode_ids", "episode_index")
 SUCCESSES = ("successes", *SUCCESS, *(f"infos/{name}" for name in SUCCESS))
 # What TrajectoryBuffer.save adds, beside ENV_ID.
 LOW, HIGH = "action_low", "action_high"
 # What is often beside, and tells nothing more.
-NOT_NEEDED = ("next_observations", "next_obs", "infos", "metadata")
+NOT_NEEDED = ("next_observations", "next_obs", "info", "infos", "metadata")
 
 
 def warn_of_made_up_rewards(names: Iterable[str], source: str) -> None:
     """
-    Where there are no rewards, say so if there is something that may have been meant by them, or by an end.
+    Where there are no rewards, say what counts instead, and what may have been meant by them, or by an end.
 
     :param names: of all arrays
     :param source: for the message
     """
     names = set(names)
-    read = {*OBSERVATIONS, *ACTIONS, *TERMINATIONS, *TRUNCATIONS, *SUCCESSES, ENDS, LENGTHS, LOW, HIGH, ENV_ID, *NOT_NEEDED}
+    if names & set(REWARDS):
+        return
+    ends = {*TERMINATIONS, *TRUNCATIONS, *DONES, *EPISODES, ENDS, LENGTHS}
+    read = {*OBSERVATIONS, *ACTIONS, *ends, *SUCCESSES, LOW, HIGH, ENV_ID, *NOT_NEEDED}
     unread = sorted(name for name in names - read if not name.startswith("infos/"))
-    if unread and not names & set(REWARDS):
-        warnings.warn(
-            f"{source}: there is none of {', '.join(REWARDS)}, so that success is rewarded, by 1 at an episode's last step. "
-            f"Not read: {', '.join(unread)}.",
-            stacklevel=2,
-        )
+    told = names & set(SUCCESSES)
+    if told and not unread:
+        return
+    counts = "so that a success is rewarded" if told else "nor any success, so that every episode counts as one, rewarded"
+    not_read = f" Not read: {', '.join(unread)}." if unread else ""
+    warnings.warn(
+        f"{source}: there is none of {', '.join(REWARDS)}, {counts} by 1 at its last step.{not_read}", stacklevel=2
+    )
 
 
 def is_flat_file(dataset: Any) -> bool:
-    """Whether this is the path of such a file: an `.npz` by its name, an hdf5 file by the actions that lie at its top."""
+    """Whether this is the path of such a file, by its name; of an hdf5 file, by the actions that lie at its top."""
     if not isinstance(dataset, str | os.PathLike):
         return False
-    if os.fspath(dataset).endswith(NPZ_SUFFIX):
+    if os.fspath(dataset).endswith((NPZ_SUFFIX, CSV_SUFFIX, PARQUET_SUFFIX)):
         return True
     with contextlib.suppress(OSError, RuntimeError, ValueError):
         path = os.path.expanduser(dataset)
         if os.path.isfile(path) and h5py.is_hdf5(path):
             with h5py.File(path, "r") as file:
-                return any(name in file for name in ACTIONS)
+                return not set(file).isdisjoint(ACTIONS)
     return False
 
 
@@ -92,7 +101,9 @@ def json_options(options: dict[str, Any]) -> dict[str, Any]:
     :param options: `action_bounds` or `action_space` among them
     """
     options = dict(options)
-    space = options.pop("action_space", None)
+    space, observed = options.pop("action_space", None), options.pop("observation_space", None)
+    if observed is not None and not isinstance(observed, spaces.Box):
+        options["observation_space"] = repr(observed)
     if space is not None:  # which counts less than a file's own bounds, and these less than those that are given
         options["environment_bounds"] = bounds_of(space)
     for name in ("action_bounds", "environment_bounds"):
@@ -102,11 +113,14 @@ def json_options(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def load_flat(
-    dataset: str | os.PathLike[str] | Mapping[str, Any],
+    dataset: Any,
     observation_keys: Sequence[str] | None = None,
+    action_keys: Sequence[str] | None = None,
     action_bounds: Sequence[Any] | None = None,
     clip_actions: bool = False,
     action_space: ActionSpace | None = None,
+    observation_space: spaces.Space | None = None,
+    max_episode_steps: int | None = None,
     on_invalid: str = "raise",
     storage: FileStorage | None = None,
 ) -> TrajectoryBuffer:
@@ -115,48 +129,70 @@ def load_flat(
 
     Read are `observations` (N, O), `actions` (N, A), or whole numbers (N,) of a Discrete space, and `rewards` (N,), or what
     others call them (`obs`, `state`, `action`, `reward`). Episodes end where `episode_ends` says (E,), counting steps from
-    the start of the file, or after `episode_lengths` (E,) each, or at the steps of `terminals` or `timeouts` (N,). `success`
-    tells of each episode (E,), NaN of one that is not known, or of each step (N,), and then an episode's last one counts.
-    Without rewards a success has a reward of 1 at its last step, and an episode of which nothing tells is one. Nothing in a
-    file is ever executed: arrays of Python objects are refused. The arrays are read into memory, also to write a cache of
-    them.
+    the start of the file, or after `episode_lengths` (E,) each, or where `episode` (N,) changes, or at the steps of
+    `terminals`, `timeouts` or `dones` (N,). Where `terminals` alone tell of ends, episodes are cut after every
+    `max_episode_steps`. `success` tells of each episode (E,), NaN of one that is not known, or of each step (N,), and then
+    an episode's last one counts. Without rewards a success has a reward of 1 at its last step, and an episode of which
+    nothing tells is one.
 
-    :param dataset: path of the file, or arrays by name
-    :param observation_keys: which arrays make up the observation, in this order, each (N, ...)
+    A table has a row for each step and a column for each number; columns that begin with `obs`, such as `obs_0`, make up the
+    observation. Nothing in a file is ever executed: arrays of Python objects are refused. The arrays are read into memory,
+    also to write a cache of them.
+
+    :param dataset: path of the file, arrays by name, or a DataFrame
+    :param observation_keys: which arrays make up the observation, in this order, each (N, ...); also entries of dictionary
+        observations
+    :param action_keys: which arrays make up the action, in this order, each (N, ...)
     :param action_bounds: smallest and largest action that the environment accepts, numbers or (A,) each; where they are not
         given, a file's own `action_low` and `action_high`, or those of `action_space`, or -1 and 1. Of Discrete actions the
         first and the last one
     :param clip_actions: bring actions outside of them to the nearest bound, however far, instead of refusing them
     :param action_space: the environment's
+    :param observation_space: the environment's, which tells what is a choice, see :func:`~sb3_dtfm.data.load_dataset`
+    :param max_episode_steps: of the environment
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
     :param storage: where the steps go, memory if not given
     :raises DatasetError: no such file, damaged, arrays missing or of lengths that do not fit together, NaN or infinity, or
         actions out of bounds; names the file, the array, the episode and the step
     """
     with opened(dataset) as arrays:
-        return _read(arrays, observation_keys, action_bounds, clip_actions, action_space, on_invalid, storage)
+        action_keys = list(action_keys or arrays.columns(ACTIONS))
+        actions = _actions(arrays, action_keys, action_space)
+        keys = list(observation_keys or arrays.columns(OBSERVATIONS))
+        observations = _observations(arrays, keys, len(actions), observation_space)
+        ends = _ends(arrays, len(actions), max_episode_steps)
+        warn_of_made_up_rewards(set(map(str, arrays.names)) - {*keys, *action_keys}, arrays.source)
+        return _read(arrays, observations, actions, ends, action_bounds, clip_actions, action_space, on_invalid, storage)
+
+
+class _Ends(NamedTuple):
+    """
+    Of the episodes.
+
+    :param stops: (E,) int64, ascending: steps of the file at which each has ended, the last one N
+    :param terminated: (N,) bool
+    :param truncated: (N,) bool
+    """
+
+    stops: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
 
 
 def _read(
     arrays: Arrays,
-    observation_keys: Sequence[str] | None,
+    observation: np.ndarray,
+    actions: np.ndarray,
+    ends: _Ends,
     action_bounds: Sequence[Any] | None,
     clip_actions: bool,
     action_space: ActionSpace | None,
     on_invalid: str,
     storage: FileStorage | None,
 ) -> TrajectoryBuffer:
-    source = arrays.source
-    actions = arrays.read(ACTIONS)
-    check_shape(actions, action_space, source)
-    n_steps = len(actions)
-    keys = observation_keys or (arrays.name(OBSERVATIONS),)
-    observations = [_observations(arrays, key, n_steps) for key in keys]
-    observation = observations[0] if len(observations) == 1 else np.concatenate(observations, axis=1)
-    terminated, truncated = (_flags(arrays, names, n_steps) for names in (TERMINATIONS, TRUNCATIONS))
-    stops = _stops(arrays, n_steps, terminated | truncated)
+    source, n_steps = arrays.source, len(actions)
+    stops, terminated, truncated = ends
     has_rewards = arrays.has(REWARDS)
-    warn_of_made_up_rewards(set(map(str, arrays.names)) - set(keys), source)
     rewards = arrays.read(REWARDS, n_steps).reshape(n_steps, -1) if has_rewards else np.zeros((n_steps, 1))
     if rewards.shape[1] != 1:
         raise DatasetError(f"{source}: rewards have {rewards.shape[1]} columns; one number a step is expected.")
@@ -164,11 +200,11 @@ def _read(
     if not has_rewards:
         done = stops[successes != 0.0] - 1
         rewards[done] = 1.0
-        terminated[done] = True
+        terminated[done], truncated[done] = True, False
     if action_bounds is None and arrays.has((LOW,)):
         action_bounds = arrays.read((LOW,)), arrays.read((HIGH,))
-    action_space = bounded_space(action_bounds, action_space, actions, source)
-    actions = fitted(actions, action_space, clip_actions)
+    space = bounded_space(action_bounds, action_space, actions, source)
+    actions = fitted(actions, space, clip_actions)
 
     def steps(first: int, end: int) -> Trajectory:
         """Those of some episodes, one after the other."""
@@ -191,23 +227,88 @@ def _read(
         one_by_one = partial(map, steps, range(first, end), range(first + 1, end + 1))
         return ShortEpisodes(steps(first, end), lengths, terminated[last], truncated[last], successes[here], one_by_one)
 
-    return TrajectoryBuffer.from_trajectories(
-        itertools.starmap(episodes, blocks(stops)),
-        action_space,
-        n_steps=n_steps,
-        source=source,
-        env_id=arrays.env_id(),
-        storage=storage,
-        on_invalid=on_invalid,
-        n_stored=arrays.n_stored,
-    )
+    with explain_range(space, action_bounds, action_space):
+        return TrajectoryBuffer.from_trajectories(
+            itertools.starmap(episodes, blocks(stops)),
+            space,
+            n_steps=n_steps,
+            source=source,
+            env_id=arrays.env_id(),
+            storage=storage,
+            on_invalid=on_invalid,
+            n_stored=arrays.n_stored,
+        )
 
 
-def _observations(arrays: Arrays, key: str, n_steps: int) -> np.ndarray:
-    """(N, .), of one array."""
-    array = arrays.read((key,), n_steps)
-    check_no_images(array, f"{arrays.source}: {key}")
-    return array.reshape(n_steps, -1)
+def _actions(arrays: Arrays, keys: Sequence[str], space: ActionSpace | None) -> np.ndarray:
+    """(N, A), or (N,) of Discrete ones."""
+    actions = arrays.read(keys[:1])
+    numbers = isinstance(space, spaces.Box) or (arrays.are_columns and actions.dtype.kind == "f")
+    if actions.ndim == 1 and (numbers or keys[0] not in ACTIONS):
+        actions = actions[:, None]
+    if len(keys) > 1:
+        n_steps = len(actions)
+        actions = np.concatenate([arrays.read((key,), n_steps).reshape(n_steps, -1) for key in keys], axis=1)
+    check_shape(actions, space, arrays.source)
+    return actions
+
+
+def _observations(arrays: Arrays, keys: Sequence[str], n_steps: int, space: spaces.Space | None) -> np.ndarray:
+    """(N, O), of arrays, or of entries of dictionary observations."""
+    if arrays.has(OBSERVATIONS) and not all(key in arrays.names for key in keys):
+        name = arrays.name(OBSERVATIONS)
+        parts = {name: chosen(arrays.stored(name), keys, space, f"{arrays.source}: {name}")}
+    else:
+        known = {key: space if key in OBSERVATIONS else part_of(space, key) for key in keys}
+        parts = {key: in_space(arrays.stored(arrays.name((key,))), known[key], f"{arrays.source}: {key}") for key in keys}
+    for name, part in parts.items():
+        if len(part) != n_steps:
+            raise DatasetError(f"{arrays.source}: {name} has shape {part.shape} and actions have {n_steps} steps.")
+    return np.concatenate(list(parts.values()), axis=1)
+
+
+def _ends(arrays: Arrays, n_steps: int, max_episode_steps: int | None) -> _Ends:
+    """Where episodes end, and how."""
+    terminated, truncated, done = (_flags(arrays, names, n_steps) for names in (TERMINATIONS, TRUNCATIONS, DONES))
+    terminated |= done & ~truncated
+    stops = _told(arrays, n_steps)
+    if stops is None:
+        ended = terminated | truncated
+        if not ended.any():
+            accepted = ", ".join((ENDS, LENGTHS, EPISODES[0], *TERMINATIONS, *TRUNCATIONS, *DONES))
+            raise DatasetError(f"{arrays.source}: does not say where episodes end; one of {accepted} is needed.")
+        stops = np.flatnonzero(ended) + 1
+        if stops[-1] != n_steps:  # the last recording stopped mid-episode
+            stops = np.append(stops, n_steps)
+        if not arrays.has((*TRUNCATIONS, *DONES)):
+            stops = _cut(stops, max_episode_steps, arrays)
+    if max_episode_steps is not None and not arrays.has(TRUNCATIONS):
+        late = stops[np.diff(stops, prepend=0) == max_episode_steps] - 1
+        terminated[late] &= arrays.has(TERMINATIONS)
+        truncated[late] = ~terminated[late]
+    return _Ends(stops, terminated, truncated)
+
+
+def _cut(stops: np.ndarray, max_episode_steps: int | None, arrays: Arrays) -> np.ndarray:
+    """Ends of episodes of which only terminations tell: those that ran out of time are joined to the next ones."""
+    told = f"{arrays.source}: {arrays.name(TERMINATIONS)} tell of terminal states, and nothing tells of time-outs"
+    if max_episode_steps is None:
+        warnings.warn(
+            f"{told}: an episode that ran out of time is joined to the next one. max_episode_steps=... cuts there, and "
+            f"{ENDS}, {EPISODES[0]} or {TRUNCATIONS[1]} would tell.",
+            stacklevel=2,
+        )
+        return stops
+    starts = np.concatenate(([0], stops[:-1]))
+    pieces = [np.append(np.arange(start + max_episode_steps, stop, max_episode_steps), stop) for start, stop in
+              zip(starts, stops, strict=True)]  # fmt: skip
+    longer = sum(len(piece) > 1 for piece in pieces)
+    if longer:
+        warnings.warn(
+            f"{told}: {longer} episodes of more than max_episode_steps={max_episode_steps} are cut after as many steps.",
+            stacklevel=2,
+        )
+    return np.concatenate(pieces)
 
 
 def _flags(arrays: Arrays, names: Sequence[str], n_steps: int) -> np.ndarray:
@@ -222,25 +323,48 @@ def _successes(arrays: Arrays, n_steps: int, stops: np.ndarray) -> np.ndarray:
     if not arrays.has(SUCCESSES):
         return np.full(len(stops), np.nan)
     array, where = np.atleast_1d(arrays.read(SUCCESSES)), f"{arrays.source}: {arrays.name(SUCCESSES)}"
-    if len(array) != len(stops):
-        return check_flags(array, n_steps, where)[stops - 1].astype(float)
-    silent = np.isnan(array) if array.dtype.kind == "f" else np.zeros(array.shape, bool)
-    told = check_flags(np.where(silent, 0, array), len(stops), where)
-    return np.where(silent.reshape(told.shape), np.nan, told)
+    of_steps = len(array) != len(stops)
+    told, silent = told_flags(array, n_steps if of_steps else len(stops), where)
+    successes = np.where(silent, np.nan, told)
+    return successes[stops - 1] if of_steps else successes
 
 
-def _stops(arrays: Arrays, n_steps: int, ended: np.ndarray) -> np.ndarray:
-    """Steps of the file at which each episode has ended, (E,) int64, ascending, the last one N."""
+def told_flags(flags: np.ndarray, n: int, where: str) -> tuple[np.ndarray, np.ndarray]:
+    """
+    :param flags: (N,) zeros, ones, and NaN where nothing is told
+    :param n: N
+    :param where: the file and the array, for messages
+    :return: (N,) bool each: the flags, and where they are NaN
+    :raises DatasetError: as :func:`~sb3_dtfm.data.trajectories.check_flags`
+    """
+    silent = np.isnan(flags) if flags.dtype.kind == "f" else np.zeros(flags.shape, bool)
+    told = check_flags(np.where(silent, 0, flags), n, where)
+    return told, silent.reshape(told.shape)
+
+
+def _told(arrays: Arrays, n_steps: int) -> np.ndarray | None:
+    """Ends of episodes, as in :class:`_Ends`, where something tells of all of them."""
     told = [_told_stops(arrays, name, n_steps) for name in (ENDS, LENGTHS) if arrays.has((name,))]
     if len(told) == 2 and not np.array_equal(told[0], told[1]):
         raise DatasetError(f"{arrays.source}: {ENDS} and {LENGTHS} tell of other episodes; one of them is enough.")
-    if told:
-        return told[0]
-    if ended.any():
-        stops = np.flatnonzero(ended) + 1
-        return stops if stops[-1] == n_steps else np.append(stops, n_steps)  # the last recording stopped mid-episode
-    accepted = ", ".join((ENDS, LENGTHS, *TERMINATIONS, *TRUNCATIONS))
-    raise DatasetError(f"{arrays.source}: does not say where episodes end; one of {accepted} is needed.")
+    return told[0] if told else _numbered(arrays, n_steps) if arrays.has(EPISODES) else None
+
+
+def _numbered(arrays: Arrays, n_steps: int) -> np.ndarray:
+    """As :func:`_told`, from the number or name of each step's episode."""
+    name = arrays.name(EPISODES)
+    numbers = np.asarray(arrays.stored(name)).reshape(-1)
+    if numbers.shape != (n_steps,):
+        raise DatasetError(f"{arrays.source}: {name} has {len(numbers)} entries; actions have {n_steps} steps.")
+    changes = np.flatnonzero(numbers[1:] != numbers[:-1]) + 1
+    starts, counts = np.unique(numbers[np.append(0, changes)].astype(str), return_counts=True)
+    if (counts > 1).any():
+        again = starts[counts > 1][0]
+        raise DatasetError(
+            f"{arrays.source}: {name} {again} comes in several places; the steps of an episode have to lie side by side, as "
+            "after a stable sort."
+        )
+    return np.append(changes, n_steps)
 
 
 def _told_stops(arrays: Arrays, name: str, n_steps: int) -> np.ndarray:
@@ -309,6 +433,27 @@ def bounded_space(bounds: Sequence[Any] | None, space: ActionSpace | None, actio
         expected = f"numbers or {n_actions[0]} each" if n_actions else "whole numbers"
         raise DatasetError(
             f"{source}: action_bounds is {bounds!r}; smallest and largest action are expected, {expected}."
+        ) from error
+
+
+@contextlib.contextmanager
+def explain_range(space: ActionSpace, bounds: Sequence[Any] | None, environment: ActionSpace | None) -> Iterator[None]:
+    """
+    Where nobody has said which range actions have, say how to tell.
+
+    :param space: what the actions are learned as
+    :param bounds: that have been given, or None
+    :param environment: its action space, or None
+    :raises DatasetError: an action lies outside of the space
+    """
+    try:
+        yield
+    except ActionRangeError as error:
+        if bounds is not None or space is environment:
+            raise
+        raise ActionRangeError(
+            f"{error} This range is assumed, since nobody tells of another. Give an environment (inspect: --env ID), or "
+            "action_bounds=(smallest, largest), or clip_actions=True."
         ) from error
 
 

@@ -1,12 +1,16 @@
 """Arrays in hdf5 files that nobody vouches for: checked before a byte of them is read."""
 
-import contextlib
 import math
+import zlib
 
 import h5py
 import numpy as np
 
+from sb3_dtfm.data.observations import STORED_AS_JPEG
 from sb3_dtfm.data.trajectories import DatasetError, check_real, check_size, wrap_dataset_errors
+
+# Links one after the other that are followed at most, which is HDF5's own limit.
+MOST_LINKS = 16
 
 
 def read_hdf5(group: h5py.Group, name: str, where: str) -> np.ndarray:
@@ -35,31 +39,97 @@ def open_hdf5(group: h5py.Group, name: str, where: str) -> tuple[h5py.h5d.Datase
     :param group: as for :func:`read_hdf5`, which says the rest too
     """
     what = f"{where}: {name}"
+    check_within(group, name, where)
     try:
         data = h5py.h5d.open(group.id, name.encode())
     except (KeyError, TypeError, ValueError, OSError, RuntimeError) as error:  # no such name, a group, a link astray
         raise DatasetError(f"{where}: has no {name!r}, only {listed(group)}; the file is incomplete.") from error
     with wrap_dataset_errors(what):
+        if not _stored_within(data):  # what is there can change without a trace, or be what nobody meant to give away
+            raise DatasetError(f"{what} lie in another file; one file that holds everything is accepted.")
         shape, dtype, n_stored = data.shape, data.dtype, data.get_storage_size()
-        in_file = h5py.h5f.get_name(data) == h5py.h5f.get_name(group.id) and _stored_within(data)
+    if h5py.check_vlen_dtype(dtype) == np.uint8:
+        raise DatasetError(f"{what} {STORED_AS_JPEG}")
     check_real(dtype, what)
     if not shape:
         raise DatasetError(f"{what} have shape {shape}; one entry for each step is expected.")
-    if not in_file:  # what is there can change without a trace, or be what nobody meant to give away
-        raise DatasetError(f"{what} lie in another file; one file that holds everything is accepted.")
     n_bytes = math.prod(shape) * dtype.itemsize
     if n_bytes and not n_stored:
         raise DatasetError(f"{what} have shape {shape}, of which nothing has been written; the file is incomplete.")
     check_size(n_bytes, n_stored, what)
+    with wrap_dataset_errors(what):
+        if n_bytes and data.get_offset() is None:
+            _check_chunks(data, shape, what)
     return data, shape, dtype
 
 
+def check_within(group: h5py.Group, name: str, where: str) -> None:
+    """
+    Look at a path's links before HDF5 follows them: to open another file can run into a pipe, and wait for ever.
+
+    :param group: where the path starts
+    :param name: the path, of whatever is there or not
+    :param where: the file and the episode, for messages
+    :raises DatasetError: a link leads to another file, or too many follow each other
+    """
+    with wrap_dataset_errors(f"{where}: {name}"):
+        if not _leads_within(group.id, name.encode()):
+            raise DatasetError(
+                f"{where}: {name!r} lies in another file, or behind links without end; one file that holds all is accepted."
+            )
+
+
+def _leads_within(group: h5py.h5g.GroupID, path: bytes, n_links: int = 0) -> bool:
+    here = h5py.h5g.open(group, b"/") if path.startswith(b"/") else group
+    parts = [part for part in path.split(b"/") if part not in (b"", b".")]
+    for number, part in enumerate(parts, 1):
+        if not here.links.exists(part):
+            return True
+        kind = here.links.get_info(part).type
+        if kind == h5py.h5l.TYPE_SOFT:
+            path = b"/".join([here.links.get_val(part), *parts[number:]])
+            return n_links < MOST_LINKS and _leads_within(here, path, n_links + 1)
+        if kind != h5py.h5l.TYPE_HARD:
+            return False
+        if number < len(parts):
+            if h5py.h5o.get_info(here, part).type != h5py.h5o.TYPE_GROUP:
+                return True
+            here = h5py.h5g.open(here, part)
+    return True
+
+
+def _check_chunks(data: h5py.h5d.DatasetID, shape: tuple[int, ...], what: str) -> None:
+    """Refuse chunks that are not there in full: HDF5 fills them with zeros, or with anything that lies in memory."""
+    layout = data.get_create_plist()
+    if layout.get_layout() != h5py.h5d.CHUNKED:
+        return
+    chunk = layout.get_chunk()
+    n_bytes = math.prod(chunk) * data.get_type().get_size()
+    n_chunks = math.prod(-(-length // of_chunk) for length, of_chunk in zip(shape, chunk, strict=True))
+    filters = [layout.get_filter(number)[0] for number in range(layout.get_nfilters())]
+    n_found = data.get_num_chunks()
+    if n_found < n_chunks or (not filters and data.get_storage_size() < n_chunks * n_bytes):
+        raise DatasetError(
+            f"{what} have shape {shape}, {n_chunks} chunks of {n_bytes} bytes; {n_found} chunks of "
+            f"{data.get_storage_size()} bytes in all are there: the file is incomplete."
+        )
+    if h5py.h5z.FILTER_DEFLATE in filters:
+        data.chunk_iter(lambda info: _check_deflated(data, info, filters.index(h5py.h5z.FILTER_DEFLATE), n_bytes, what))
+
+
+def _check_deflated(data: h5py.h5d.DatasetID, info: h5py.h5d.StoreInfo, number: int, n_bytes: int, what: str) -> None:
+    stored = data.read_direct_chunk(info.chunk_offset)[1]
+    passed_by = info.filter_mask >> number & 1
+    n_found = len(stored) if passed_by else len(zlib.decompressobj().decompress(stored, n_bytes))
+    if n_found < n_bytes:
+        at = f"the chunk at {info.chunk_offset}"
+        raise DatasetError(f"{what}: {at} holds {n_found} bytes of {n_bytes}; the file is incomplete.")
+
+
 def _stored_within(data: h5py.h5d.DatasetID) -> bool:
-    """Whether the numbers lie in the file that describes them."""
+    """Whether the numbers lie in the file that describes them; to ask a virtual array for its shape opens other files."""
     if data.get_offset() is not None:
         return True
-    with contextlib.suppress(TypeError, ValueError, RuntimeError):  # chunks always do, and a look at one takes no time
-        return data.get_chunk_info(0) is not None
     layout = data.get_create_plist()
     return layout.get_layout() != h5py.h5d.VIRTUAL and layout.get_external_count() == 0
 
@@ -73,12 +143,11 @@ def open_group(parent: h5py.Group, name: str, where: str) -> h5py.Group:
     :param where: the file, for messages
     :raises DatasetError: there is none, or it lies in another file
     """
+    check_within(parent, name, where)
     with wrap_dataset_errors(f"{where}: {name}"):
         group = parent.get(name)
         if not isinstance(group, h5py.Group):
             raise DatasetError(f"{where}: has no group {name!r}, only {listed(parent)}.")
-        if h5py.h5f.get_name(group.id) != h5py.h5f.get_name(parent.id):
-            raise DatasetError(f"{where}: group {name!r} lies in another file; one file that holds everything is accepted.")
         return group
 
 

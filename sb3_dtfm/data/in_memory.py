@@ -2,8 +2,9 @@
 
 import itertools
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from sb3_dtfm.data.arrays import NUMBERS_EXPECTED
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.flat import (
     ACTIONS,
+    DONES,
     OBSERVATIONS,
     REWARDS,
     SUCCESSES,
@@ -22,17 +24,24 @@ from sb3_dtfm.data.flat import (
     TRUNCATIONS,
     bounded_space,
     check_shape,
+    explain_range,
     fitted,
+    load_flat,
+    told_flags,
     warn_of_made_up_rewards,
 )
-from sb3_dtfm.data.observations import as_vectors, flatten_observations
+from sb3_dtfm.data.observations import chosen, chosen_space, flatten_chosen, in_space
 from sb3_dtfm.data.storage import FileStorage
-from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_space, check_flags, wrap_dataset_errors
-from sb3_dtfm.envs.return_to_go import flatten_observation_space, sort_observation_space
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_space, wrap_dataset_errors
+from sb3_dtfm.envs.return_to_go import flatten_observation_space
 from sb3_dtfm.envs.success import reported_success
 
-# What one step of an episode that was written down step by step holds.
+# What one step of an episode that was written down step by step holds: Gymnasium's, SB3's, and the shortest.
 STEP = ("observation", "action", "reward", "terminated", "truncated")
+SB3_STEP = ("observation", "action", "next_observation", "reward", "done")
+SHORT_STEP = ("observation", "action", "reward", "done")
+INFO = ("info", "infos")
+PARTS = (REWARDS, ACTIONS, OBSERVATIONS)
 
 
 def is_episodes(dataset: Any) -> bool:
@@ -40,11 +49,104 @@ def is_episodes(dataset: Any) -> bool:
     return isinstance(dataset, Sequence) and not isinstance(dataset, str | bytes | os.PathLike)
 
 
-def load_episodes(
-    episodes: Sequence[Any],
+def is_steps(dataset: Any) -> bool:
+    """Whether this is a list of steps, of one or of several episodes."""
+    return is_episodes(dataset) and len(dataset) > 0 and _is_step(dataset[0])
+
+
+def _is_step(found: Any) -> bool:
+    """Whether this is one step, by its reward, a number; without a reward, by an action and an observation of one step."""
+    if isinstance(found, Mapping):
+        given = (next((_n_axes(found[name]) for name in names if name in found), None) for names in PARTS)
+        reward, action, observation = given
+        return reward == 0 if reward is not None else action == 0 or action == observation == 1
+    if not is_episodes(found) or not len(found):
+        return False
+    parts = _parts(found)
+    return len(parts) >= len(SHORT_STEP) and not isinstance(parts[-1], Mapping | Sequence) and np.size(parts[-1]) == 1
+
+
+def _n_axes(found: Any) -> int:
+    """Of an array, or of nested lists; of lists of different lengths, those of a whole episode."""
+    try:
+        return np.ndim(found)
+    except ValueError:
+        return 2
+
+
+def _parts(step: Sequence[Any]) -> list[Any]:
+    """What a step begins with, without its info, and without what comes after the flags."""
+    n_first = len(SHORT_STEP)
+    return [*step[:n_first], *(part for part in step[n_first:] if not isinstance(part, Mapping))][: len(STEP)]
+
+
+def load_steps(
+    steps: Sequence[Any],
+    observation_keys: Sequence[str] | None = None,
+    action_keys: Sequence[str] | None = None,
     action_bounds: Sequence[Any] | None = None,
     clip_actions: bool = False,
     action_space: ActionSpace | None = None,
+    observation_space: spaces.Space | None = None,
+    max_episode_steps: int | None = None,
+    on_invalid: str = "raise",
+    storage: FileStorage | None = None,
+) -> TrajectoryBuffer:
+    """
+    Steps of all episodes in one list, as :func:`load_episodes` takes those of each; flags or numbers tell of the ends.
+
+    :param steps: dictionaries, with the names of :func:`~sb3_dtfm.data.load_flat`, or tuples; the other arguments are those
+        of :func:`~sb3_dtfm.data.load_flat`
+    :raises DatasetError: as :func:`~sb3_dtfm.data.load_flat`
+    """
+    with wrap_dataset_errors("steps", NUMBERS_EXPECTED):
+        arrays = _arrays_of_steps(steps, "steps")
+    return load_flat(
+        arrays, observation_keys, action_keys, action_bounds, clip_actions, action_space, observation_space,
+        max_episode_steps, on_invalid, storage,
+    )  # fmt: skip
+
+
+def _arrays_of_steps(steps: Sequence[Any], where: str) -> dict[str, Any]:
+    """Arrays by the names of flat ones; of infos their success, and whether time ran out."""
+    rows = steps if isinstance(steps[0], Mapping) else [_named(step) for step in steps]
+    arrays: dict[str, Any] = {}
+    for name in rows[0]:
+        missing = next((number for number, row in enumerate(rows) if name not in row), None)
+        if missing is not None:
+            raise DatasetError(f"{where}: step {missing} has no {name!r}, which step 0 has.")
+        arrays[name] = _stacked([row[name] for row in rows]) if name in OBSERVATIONS else [row[name] for row in rows]
+    infos = next((arrays.pop(name) for name in INFO if name in arrays), None)
+    if infos is not None and all(isinstance(info, Mapping) for info in infos):
+        reported = [reported_success(info) for info in infos]
+        if any(success is not None for success in reported):
+            arrays["success"] = [np.nan if success is None else float(success) for success in reported]
+        if any("TimeLimit.truncated" in info for info in infos) and not set(TRUNCATIONS) & set(arrays):
+            arrays[TRUNCATIONS[0]] = [bool(info.get("TimeLimit.truncated", False)) for info in infos]
+    return arrays
+
+
+def _named(step: Sequence[Any]) -> dict[str, Any]:
+    """A step's parts by their names."""
+    infos = [part for part in step[len(SHORT_STEP) :] if isinstance(part, Mapping)]
+    parts = _parts(step)
+    names: tuple[str, ...] = SHORT_STEP
+    if len(parts) == len(STEP):
+        # Of observations that are numbers, only the types tell a reward and a flag from two flags.
+        told_apart = np.ndim(step[0]) > 0 or type(step[3]) is not type(step[4])
+        followed = np.shape(step[2]) == np.shape(step[0]) and not isinstance(step[3], bool | np.bool_) and told_apart
+        names = SB3_STEP if followed or isinstance(step[2], Mapping) else STEP
+    found = {name: part for name, part in zip(names, parts, strict=True) if name != "next_observation"}
+    return {**found, **({INFO[0]: infos[0]} if infos else {})}
+
+
+def load_episodes(
+    episodes: Sequence[Any],
+    observation_keys: Sequence[str] | None = None,
+    action_bounds: Sequence[Any] | None = None,
+    clip_actions: bool = False,
+    action_space: ActionSpace | None = None,
+    observation_space: spaces.Space | None = None,
     on_invalid: str = "raise",
     storage: FileStorage | None = None,
 ) -> TrajectoryBuffer:
@@ -58,14 +160,17 @@ def load_episodes(
     - a trajectory of the package imitation: `obs`, `acts`, `terminal`, `rews` where it has some
     - a list of steps `(observation, action, reward, terminated, truncated)`, as they come from a Gymnasium environment:
       the observation that the action was chosen on, and what `env.step(action)` then returned, with the info, whose success
-      is known of the episode, or without
+      is known of the episode, or without; or of `(observation, action, reward, done)`, of SB3's `(observation, action,
+      next_observation, reward, done)`, or of dictionaries of these
 
     Without rewards a success has a reward of 1 at its last step, and every episode is one where nothing tells.
 
     :param episodes: at least one
+    :param observation_keys: which arrays, or entries of dictionary observations, make up the observation, in this order
     :param action_bounds: see :func:`~sb3_dtfm.data.load_flat`
     :param clip_actions: see :func:`~sb3_dtfm.data.load_flat`
     :param action_space: see :func:`~sb3_dtfm.data.load_flat`
+    :param observation_space: see :func:`~sb3_dtfm.data.load_flat`
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
     :param storage: where the steps go, memory if not given
     :raises DatasetError: nothing of the above, arrays missing or of lengths that do not fit together, NaN or infinity, or
@@ -73,24 +178,35 @@ def load_episodes(
     """
     source = "episodes"
     if len(episodes) and isinstance(episodes[0], Mapping):
-        warn_of_made_up_rewards(map(str, episodes[0]), source)
-    space = bounded_space(action_bounds, action_space, _some_actions(episodes, action_space, source, on_invalid), source)
+        warn_of_made_up_rewards(set(map(str, episodes[0])) - set(observation_keys or ()), source)
+    elif len(episodes) and hasattr(episodes[0], "acts"):
+        warn_of_made_up_rewards((name for name in REWARDS if hasattr(episodes[0], name)), source)
+    read = partial(_trajectory, source=source, keys=observation_keys, observation_space=observation_space)
+    actions = _some_actions(episodes, action_space, read, source, on_invalid)
+    space = bounded_space(action_bounds, action_space, actions, source)
 
     def trajectory(number: int) -> Trajectory:
-        found = _trajectory(episodes[number], number, source)
+        found = read(episodes[number], number)
         return replace(found, actions=fitted(found.actions, space, clip_actions))
 
     numbers = range(len(episodes))
-    return TrajectoryBuffer.from_trajectories(
-        map(trajectory, numbers), space, source=source, storage=storage, on_invalid=on_invalid
-    )
+    with explain_range(space, action_bounds, action_space):
+        return TrajectoryBuffer.from_trajectories(
+            map(trajectory, numbers), space, source=source, storage=storage, on_invalid=on_invalid
+        )
 
 
-def _some_actions(episodes: Sequence[Any], action_space: ActionSpace | None, source: str, on_invalid: str) -> np.ndarray:
+def _some_actions(
+    episodes: Sequence[Any],
+    action_space: ActionSpace | None,
+    read: Callable[[Any, int], Trajectory],
+    source: str,
+    on_invalid: str,
+) -> np.ndarray:
     """The actions of the first episode, or the first that can be kept."""
     for number, episode in enumerate(episodes):
         try:
-            actions = _trajectory(episode, number, source).actions
+            actions = read(episode, number).actions
             check_shape(actions, action_space, f"{source}, episode {number}")
             return actions
         except DatasetError:
@@ -99,32 +215,37 @@ def _some_actions(episodes: Sequence[Any], action_space: ActionSpace | None, sou
     raise DatasetError(f"{source}: the list is empty; at least one episode is needed.")
 
 
-def _trajectory(episode: Any, number: int, source: str) -> Trajectory:
+def _trajectory(
+    episode: Any, number: int, source: str, keys: Sequence[str] | None, observation_space: spaces.Space | None
+) -> Trajectory:
     """An episode of any of the kinds of :func:`load_episodes`."""
     name = f"episode {number}"
     where = f"{source}, {name}"
     if isinstance(episode, Trajectory):
         return episode
     with wrap_dataset_errors(where, NUMBERS_EXPECTED):
-        if isinstance(episode, Mapping):
-            return _of_arrays(episode, name, where)
-        if hasattr(episode, "obs") and hasattr(episode, "acts"):
-            ended = bool(episode.terminal)
-            infos = getattr(episode, "infos", None)
-            info = {} if infos is None else infos[-1]
-            late = ended and bool(info.get("TimeLimit.truncated", False))
-            arrays = {"obs": episode.obs, "acts": episode.acts, "terminated": ended and not late, "truncated": late}
-            arrays["success"] = reported_success(info)
-            return _of_arrays({**arrays, **({"rews": episode.rews} if hasattr(episode, "rews") else {})}, name, where)
-        if is_episodes(episode) and all(is_episodes(step) and len(step) >= len(STEP) for step in episode):
-            observations, actions, rewards, terminated, truncated = list(zip(*episode, strict=False))[: len(STEP)]
-            arrays = {"obs": _stacked(observations), "acts": actions, "rews": rewards}
-            infos = [part for part in episode[-1][len(STEP) :] if isinstance(part, Mapping)]
-            arrays["success"] = reported_success(infos[0]) if infos else None
-            return _of_arrays({**arrays, "terminated": terminated, "truncated": truncated}, name, where)
+        arrays = _arrays_of_episode(episode, where)
+        return _of_arrays(arrays, keys, observation_space, name, where)
+
+
+def _arrays_of_episode(episode: Any, where: str) -> Mapping[str, Any]:
+    """Its arrays by the names of flat ones."""
+    if isinstance(episode, Mapping):
+        return episode
+    if hasattr(episode, "obs") and hasattr(episode, "acts"):
+        ended = bool(episode.terminal)
+        infos = getattr(episode, "infos", None)
+        info = {} if infos is None else infos[-1]
+        late = ended and bool(info.get("TimeLimit.truncated", False))
+        arrays = {"obs": episode.obs, "acts": episode.acts, "terminated": ended and not late, "truncated": late}
+        arrays["success"] = reported_success(info)
+        return {**arrays, **({"rews": episode.rews} if hasattr(episode, "rews") else {})}
+    if is_episodes(episode) and len(episode) and all(_is_step(step) for step in episode):
+        return _arrays_of_steps(episode, where)
+    steps = "; ".join(", ".join(names) for names in (STEP, SB3_STEP, SHORT_STEP))
     raise DatasetError(
         f"{where} is a {type(episode).__name__}; accepted are a dictionary of arrays, a Trajectory, a trajectory of "
-        f"imitation, or a list of steps ({', '.join(STEP)})."
+        f"imitation, or a list of steps ({steps})."
     )
 
 
@@ -135,7 +256,9 @@ def _stacked(observations: Sequence[Any]) -> Any:
     return np.stack([np.asarray(observation) for observation in observations])
 
 
-def _of_arrays(arrays: Mapping[str, Any], name: str, where: str) -> Trajectory:
+def _of_arrays(
+    arrays: Mapping[str, Any], keys: Sequence[str] | None, space: spaces.Space | None, name: str, where: str
+) -> Trajectory:
     """One episode of arrays by the names of flat ones."""
 
     def find(names: Sequence[str]) -> Any:
@@ -154,13 +277,18 @@ def _of_arrays(arrays: Mapping[str, Any], name: str, where: str) -> Trajectory:
 
     actions = np.asarray(find(ACTIONS))
     n_steps = len(actions) if actions.ndim else 0
-    observations = as_vectors(find(OBSERVATIONS), f"{where}: observations")
+    if keys is None:
+        observations = in_space(find(OBSERVATIONS), space, f"{where}: observations")
+    else:
+        entries = arrays if all(key in arrays for key in keys) else find(OBSERVATIONS)
+        observations = chosen(entries, keys, space, f"{where}: observations")
     if len(observations) == n_steps + 1:  # the last one, after which nobody has acted
         observations = observations[:n_steps]
     has_rewards = any(key in arrays for key in REWARDS)
     success = _success(arrays, n_steps, where)
     rewards = np.asarray(find(REWARDS)) if has_rewards else (success is not False) * np.eye(1, n_steps, n_steps - 1)[0]
-    terminated, truncated = flag(TERMINATIONS), flag(TRUNCATIONS)
+    terminated, truncated, done = flag(TERMINATIONS), flag(TRUNCATIONS), flag(DONES)
+    terminated = terminated or (done and not truncated)
     return Trajectory(
         observations=observations,
         actions=actions,
@@ -179,7 +307,8 @@ def _success(arrays: Mapping[str, Any], n_steps: int, where: str) -> bool | None
         return None
     flags = np.asarray(arrays[name])
     flags = flags.reshape(1) if flags.size == 1 else flags
-    return bool(check_flags(flags, 1 if len(flags) == 1 else n_steps, f"{where}: {name}")[-1])
+    told, silent = told_flags(flags, 1 if len(flags) == 1 else n_steps, f"{where}: {name}")
+    return None if silent[-1] else bool(told[-1])
 
 
 def is_replay_buffer(dataset: Any) -> bool:
@@ -206,7 +335,11 @@ def _breaks(replay_buffer: ReplayBuffer, order: np.ndarray) -> np.ndarray:
 
 
 def load_replay_buffer(
-    replay_buffer: ReplayBuffer, on_invalid: str = "raise", storage: FileStorage | None = None
+    replay_buffer: ReplayBuffer,
+    observation_keys: Sequence[str] | None = None,
+    clip_actions: bool = False,
+    on_invalid: str = "raise",
+    storage: FileStorage | None = None,
 ) -> TrajectoryBuffer:
     """
     The episodes of a replay buffer, such as `model.replay_buffer` of an SB3 model, environment by environment.
@@ -218,6 +351,8 @@ def load_replay_buffer(
     buffer, the first one of each environment is left out, since its beginning has been written over.
 
     :param replay_buffer: of any number of environments
+    :param observation_keys: which entries of dictionary observations make up the observation, in this order
+    :param clip_actions: bring actions outside of the action space to the nearest bound
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
     :param storage: where the steps go, memory if not given
     :raises DatasetError: no whole episode, an observation space that cannot be flattened, NaN or infinity, or actions
@@ -225,8 +360,10 @@ def load_replay_buffer(
     """
     source = "replay buffer"
     try:
-        observation_space = sort_observation_space(replay_buffer.observation_space)
+        observation_space = chosen_space(replay_buffer.observation_space, observation_keys, source)
         flat_space = flatten_observation_space(observation_space)
+    except DatasetError:
+        raise
     except ValueError as error:
         raise DatasetError(f"{source}: {error}") from error
     space = check_action_space(replay_buffer.action_space, source)
@@ -254,13 +391,13 @@ def load_replay_buffer(
                 observations = observations[key]
             return np.asarray(observations[steps, env])
 
-        columns = flatten_observations(read, ("observations",), observation_space, f"{source}, {name}")
+        columns = flatten_chosen(read, observation_keys, observation_space, f"{source}, {name}")
         actions = replay_buffer.actions[steps, env]
         if isinstance(space, spaces.Box):
             actions = space.low + 0.5 * (actions.astype(np.float64) + 1.0) * (space.high - space.low)
         return Trajectory(
             observations=np.concatenate(columns, axis=1),
-            actions=fitted(actions, space, clip=False),
+            actions=fitted(actions, space, clip_actions),
             rewards=replay_buffer.rewards[steps, env],
             terminated=done and not late,
             truncated=done and late,

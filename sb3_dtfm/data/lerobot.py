@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from sb3_dtfm.actions import ActionSpace
-from sb3_dtfm.data.arrow import import_pyarrow
+from sb3_dtfm.arguments import COUNT
+from sb3_dtfm.data.arrow import as_numbers, import_pyarrow
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, files_below
-from sb3_dtfm.data.flat import bounded_space, fitted, json_options
+from sb3_dtfm.data.flat import bounded_space, fitted, json_options, warn_of_made_up_rewards
 from sb3_dtfm.data.storage import FileStorage
-from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_real, check_size, wrap_dataset_errors
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_flags, check_size, wrap_dataset_errors
 
 INFO, DATA = "meta/info.json", "data"
 ACTION, REWARD, SUCCESS, DONE = "action", "next.reward", "next.success", "next.done"
@@ -43,6 +45,7 @@ def fingerprint_lerobot(path: str | os.PathLike[str], options: dict[str, Any]) -
 def load_lerobot(
     path: str | os.PathLike[str],
     observation_keys: Sequence[str] | None = None,
+    episodes: Sequence[int] | None = None,
     action_bounds: Sequence[Any] | None = None,
     clip_actions: bool = False,
     action_space: ActionSpace | None = None,
@@ -58,6 +61,7 @@ def load_lerobot(
 
     :param path: the folder
     :param observation_keys: which features make up the observation, in this order, as `observation.state`
+    :param episodes: numbers of the episodes to read, in this order; all if not given
     :param action_bounds: smallest and largest action, numbers or (A,) each; where they are not given, those of
         `action_space`, or what has been recorded
     :param clip_actions: bring actions outside of them to the nearest bound, however far, instead of refusing them
@@ -69,10 +73,7 @@ def load_lerobot(
     """
     folder = Path(path).expanduser()
     source = str(folder)
-    with wrap_dataset_errors(f"{source}: {INFO}"):
-        info = json.loads((folder / INFO).read_text())
-        features = {name: tuple(each["shape"]) for name, each in info["features"].items() if each["dtype"] in NUMBERS}
-        told = {"total_frames": int(info["total_frames"]), "total_episodes": int(info["total_episodes"])}
+    features, told = _info(folder, source)
     keys = list(observation_keys or sorted(name for name in features if name.startswith(OBSERVATION)))
     for name in (*keys, ACTION):
         if name not in features:
@@ -83,6 +84,7 @@ def load_lerobot(
         )
     labels = [name for name in (REWARD, SUCCESS, DONE) if name in features]
     columns, n_stored = _read(folder, [*keys, ACTION, *labels, EPISODE, FRAME], told["total_frames"], source)
+    _check_labels(columns, labels, source)
     order = np.lexsort((columns[FRAME][:, 0], columns[EPISODE][:, 0]))
     columns = {name: values[order] for name, values in columns.items()}
     numbers, starts = np.unique(columns[EPISODE][:, 0], return_index=True)
@@ -90,6 +92,9 @@ def load_lerobot(
     if len(numbers) != told["total_episodes"]:
         told_of = f"{INFO} tells of {told['total_episodes']} episodes"
         raise DatasetError(f"{source}: {told_of}; there are {len(numbers)}.")
+    if not labels or labels == [DONE]:
+        warn_of_made_up_rewards((), source)
+    wanted = range(len(numbers)) if episodes is None else [_place(number, numbers, source) for number in episodes]
     actions = columns[ACTION]
     if action_bounds is None and action_space is None:
         action_bounds = _recorded(actions)
@@ -97,7 +102,8 @@ def load_lerobot(
     observations = np.concatenate([columns[key] for key in keys], axis=1)
     actions = fitted(actions, space, clip_actions)
 
-    def trajectory(number: int, start: int, stop: int) -> Trajectory:
+    def trajectory(place: int) -> Trajectory:
+        number, start, stop = int(numbers[place]), int(starts[place]), int(stops[place])
         steps = slice(start, stop)
         frames = columns[FRAME][steps, 0]
         if not np.array_equal(frames, np.arange(stop - start)):
@@ -123,14 +129,41 @@ def load_lerobot(
         )
 
     return TrajectoryBuffer.from_trajectories(
-        map(trajectory, map(int, numbers), map(int, starts), map(int, stops)),
+        map(trajectory, wanted),
         space,
-        n_steps=len(order),
+        n_steps=int(sum(stops[i] - starts[i] for i in wanted)),
         source=source,
         storage=storage,
         on_invalid=on_invalid,
         n_stored=n_stored,
     )
+
+
+def _info(folder: Path, source: str) -> tuple[dict[str, tuple[int, ...]], dict[str, int]]:
+    """Shapes of the features that are numbers, and how many frames and episodes there should be."""
+    with wrap_dataset_errors(f"{source}: {INFO}"):
+        (path,) = (path for path in files_below(folder, "meta") if path == folder / INFO)
+        info = json.loads(path.read_text())
+        version = info.get("codebase_version")
+        if not re.fullmatch(r"v[23]\.\d+", str(version)):
+            raise DatasetError(f"{source}: {INFO}: codebase_version is {version!r:.20}; formats v2.0 to v3.0 are read.")
+        told = {name: info[name] for name in ("total_frames", "total_episodes")}
+        for name, count in told.items():
+            if not COUNT.accepts(count):
+                raise DatasetError(f"{source}: {INFO}: {name} is {count!r:.20}; {COUNT} is expected.")
+        return {name: tuple(each["shape"]) for name, each in info["features"].items() if each["dtype"] in NUMBERS}, told
+
+
+def _check_labels(columns: dict[str, np.ndarray], labels: Sequence[str], source: str) -> None:
+    """Refuse what is not one number a frame, and of the right kind."""
+    for name in (*labels, EPISODE, FRAME):
+        if columns[name].shape[1] != 1:
+            raise DatasetError(f"{source}: {name} has {columns[name].shape[1]} numbers a frame; one is expected.")
+    for name in set(labels) - {REWARD}:
+        check_flags(columns[name], len(columns[name]), f"{source}: {name}")
+    odd = columns[EPISODE] % 1 != 0
+    if odd.any():
+        raise DatasetError(f"{source}: {EPISODE} is {columns[EPISODE][odd][0]}; whole numbers are expected.")
 
 
 def _read(folder: Path, names: Sequence[str], n_frames: int, source: str) -> tuple[dict[str, np.ndarray], int]:
@@ -140,7 +173,7 @@ def _read(folder: Path, names: Sequence[str], n_frames: int, source: str) -> tup
     :param names: of the columns
     :param n_frames: N, as the dataset tells
     """
-    paths = [path for path in files_below(folder / DATA) if path.suffix == ".parquet"]
+    paths = [path for path in files_below(folder, DATA) if path.suffix == ".parquet"]
     if not paths:
         raise DatasetError(f"{source}: there is no parquet file below {DATA}.")
     pyarrow = import_pyarrow(source)
@@ -158,25 +191,18 @@ def _read(folder: Path, names: Sequence[str], n_frames: int, source: str) -> tup
             check_size(8 * n_numbers, n_stored, f"{source}: {n_found} frames")
             table = file.read(columns=list(names))
             table.validate(full=True)
-            parts.append({name: _numbers(table[name].combine_chunks(), f"{path}: {name}") for name in names})
+            parts.append({name: as_numbers(table[name].combine_chunks(), f"{path}: {name}") for name in names})
     if n_found != n_frames:
         raise DatasetError(f"{source}: {INFO} tells of {n_frames} frames; there are {n_found}.")
     with wrap_dataset_errors(source):
         return {name: np.concatenate([part[name] for part in parts]) for name in names}, n_stored
 
 
-def _numbers(values: Any, where: str) -> np.ndarray:
-    """A column as (N, .), whose entries are numbers or lists of as many."""
-    n_rows = len(values)
-    pyarrow = import_pyarrow(where)
-    if pyarrow.types.is_list(values.type) or pyarrow.types.is_fixed_size_list(values.type):
-        sizes = np.unique(np.diff(values.offsets.to_numpy())) if pyarrow.types.is_list(values.type) else np.zeros(1)
-        if len(sizes) > 1:
-            raise DatasetError(f"{where} holds lists of {sizes[0]} to {sizes[-1]} numbers; one length is expected.")
-        values = values.flatten()
-    array = values.to_numpy(zero_copy_only=False)
-    check_real(array.dtype, where)
-    return array.reshape(n_rows, -1)
+def _place(number: int, numbers: np.ndarray, source: str) -> int:
+    found = np.flatnonzero(numbers == number)
+    if len(found) != 1:
+        raise DatasetError(f"{source}: there is no episode {number!r}, only {numbers[0]:g} to {numbers[-1]:g}.")
+    return int(found[0])
 
 
 def _recorded(actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

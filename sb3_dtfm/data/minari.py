@@ -3,9 +3,11 @@
 import contextlib
 import json
 import math
+import os
 import reprlib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,18 +15,20 @@ import h5py
 import minari
 import numpy as np
 from gymnasium import spaces
+from minari.dataset._storages import get_minari_storage
 from minari.dataset.minari_dataset import parse_dataset_id
 from minari.serialization import deserialize_space
 from minari.storage import get_dataset_path
 
 from sb3_dtfm.data.arrow import import_pyarrow
 from sb3_dtfm.data.buffer import TrajectoryBuffer
-from sb3_dtfm.data.cache import Fingerprint
+from sb3_dtfm.data.cache import Fingerprint, existing_file, files_below
+from sb3_dtfm.data.flat import fitted
 from sb3_dtfm.data.hdf5 import open_group, read_hdf5
-from sb3_dtfm.data.observations import ReadArray, flatten_observations
+from sb3_dtfm.data.observations import ReadArray, chosen_space, flatten_chosen
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, check_flags, wrap_dataset_errors
-from sb3_dtfm.envs.return_to_go import flatten_observation_space, sort_observation_space
+from sb3_dtfm.envs.return_to_go import flatten_observation_space
 from sb3_dtfm.envs.success import SUCCESS
 
 METADATA_FILE_NAME, HDF5_FILE_NAME = "metadata.json", "main_data.hdf5"
@@ -36,7 +40,7 @@ INFOS = "infos"
 FIELDS: dict[str, tuple[tuple[type, ...], bool]] = {
     "dataset_id": ((str,), True),
     "minari_version": ((str,), True),
-    "data_format": ((str,), True),
+    "data_format": ((str,), False),
     "total_episodes": ((int,), True),
     "total_steps": ((int,), True),
     "observation_space": ((str,), True),
@@ -46,6 +50,8 @@ FIELDS: dict[str, tuple[tuple[type, ...], bool]] = {
     "ref_min_score": ((int, float), False),
     "ref_max_score": ((int, float), False),
 }
+# Seconds in which a server has to answer.
+REACHED_AFTER = 10.0
 FORMATS = ("hdf5", "arrow", "parquet")
 # Entries of the vector that a step's observation, or action, becomes: no task has as many.
 MOST_ENTRIES = 2**20
@@ -80,7 +86,11 @@ def _is_whole(dataset: minari.MinariDataset) -> bool:
 
 
 def load_minari(
-    dataset: str | minari.MinariDataset, on_invalid: str = "raise", storage: FileStorage | None = None
+    dataset: str | minari.MinariDataset,
+    observation_keys: Sequence[str] | None = None,
+    clip_actions: bool = False,
+    on_invalid: str = "raise",
+    storage: FileStorage | None = None,
 ) -> TrajectoryBuffer:
     """
     Read a Minari dataset: a local one, else one that Minari's own client downloads.
@@ -88,6 +98,8 @@ def load_minari(
     Nothing that its metadata name is imported, built or run: of `env_spec` only the id is read.
 
     :param dataset: id (`namespace/name-vN`) or an opened dataset, whose choice of episodes is kept
+    :param observation_keys: which entries of dictionary observations make up the observation, in this order
+    :param clip_actions: bring actions outside of the dataset's action space to the nearest bound
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
     :param storage: where the steps go, memory if not given
     :return: its episodes, with the normalised-score scale of its metadata where it names one
@@ -103,18 +115,19 @@ def load_minari(
         raise DatasetError(f"{source}: holds no episode; at least one is needed.")
     with contextlib.ExitStack() as stack, wrap_dataset_errors(source):
         env_spec = dataset.env_spec
-        observation_space = _flat(dataset.observation_space, source)
+        observation_space, action_space = _space(dataset.observation_space, observation_keys, source), dataset.action_space
         read = _hdf5_reader(stack, folder, source) if in_hdf5 else _arrow_reader(dataset.storage.FORMAT, folder, source)
 
         def trajectory(index: int) -> Trajectory:
             name = f"episode {index}"
             with wrap_dataset_errors(f"{source}, {name}"):
-                return make_trajectory(*read(index), dataset.observation_space, name, source)
+                found = make_trajectory(*read(index), observation_keys, observation_space, name, source)
+                return replace(found, actions=fitted(found.actions, action_space, clip_actions))
 
         buffer = TrajectoryBuffer.from_trajectories(
             map(trajectory, dataset.episode_indices.tolist()),
-            dataset.action_space,
-            observation_space,
+            action_space,
+            flatten_observation_space(observation_space),
             n_steps=dataset.total_steps,
             source=source,
             score_reference=_score_reference(metadata),
@@ -141,13 +154,22 @@ def open_minari(dataset_id: str) -> minari.MinariDataset:
     folder = get_dataset_path(dataset_id) / "data"
     if not folder.exists():
         _download(dataset_id)
-    read_metadata(folder, dataset_id)
-    with wrap_dataset_errors(f"Minari dataset {dataset_id} ({folder / METADATA_FILE_NAME})"):
-        return minari.load_dataset(dataset_id)
+    metadata = read_metadata(folder, dataset_id)
+    source = f"Minari dataset {dataset_id} ({folder / METADATA_FILE_NAME})"
+    if metadata["minari_version"] not in minari.supported_dataset_versions:
+        raise DatasetError(
+            f"{source}: was written by Minari {metadata['minari_version']!r:.20}, which the installed Minari "
+            f"{minari.__version__} does not read: pip install --upgrade minari."
+        )
+    with wrap_dataset_errors(source):
+        space, action_space = (deserialize_space(metadata[name]) for name in ("observation_space", "action_space"))
+        return minari.MinariDataset(get_minari_storage(metadata["data_format"])(folder, space, action_space))
 
 
 def _download(dataset_id: str) -> None:
     try:
+        if os.getenv("MINARI_REMOTE", "hf://").startswith("hf://"):
+            _reach_hub()
         minari.download_dataset(dataset_id)
     except Exception as error:  # whatever the remote's client raises
         with warnings.catch_warnings():
@@ -158,6 +180,14 @@ def _download(dataset_id: str) -> None:
             f"Minari dataset {dataset_id} is not in {get_dataset_path()} (set by MINARI_DATASETS_PATH), which holds "
             f"{', '.join(local) if local else 'no dataset'}; and it cannot be downloaded: {why}"
         ) from error
+
+
+def _reach_hub() -> None:
+    """Fail at once where there is no way to Hugging Face's hub, which its client would look for again and again."""
+    from huggingface_hub.constants import ENDPOINT
+    from huggingface_hub.utils import get_session
+
+    get_session().head(ENDPOINT, timeout=REACHED_AFTER)
 
 
 def read_metadata(folder: Path, dataset_id: str) -> dict[str, Any]:
@@ -174,7 +204,7 @@ def read_metadata(folder: Path, dataset_id: str) -> dict[str, Any]:
     path = folder / METADATA_FILE_NAME
     source = f"Minari dataset {dataset_id} ({path})"
     with wrap_dataset_errors(source):
-        metadata = json.loads(path.read_text())
+        metadata = json.loads(existing_file(path, "what a Minari dataset says of itself").read_text())
     if not isinstance(metadata, dict):
         raise DatasetError(f"{source}: holds a {type(metadata).__name__}; a JSON object is expected.")
     _check_fields(metadata, source)
@@ -202,6 +232,7 @@ def _check_fields(metadata: dict[str, Any], source: str) -> None:
             raise DatasetError(f"{source}: {name} is {reprlib.repr(value)}; expected is one of type {expected}.")
         if isinstance(value, int | float) and not (math.isfinite(value) and (value >= 0 or name.startswith("ref"))):
             raise DatasetError(f"{source}: {name} is {value}; a number is expected, and a count of at least 0.")
+    metadata.setdefault("data_format", FORMATS[0])  # which the first versions did not name, since there was no other
     if metadata["data_format"] not in FORMATS:
         found = f"data_format is {reprlib.repr(metadata['data_format'])}"
         raise DatasetError(f"{source}: {found}; accepted are {', '.join(FORMATS)}.")
@@ -222,13 +253,15 @@ def _n_episodes(folder: Path, data_format: str, dataset_id: str) -> int:
     with wrap_dataset_errors(f"Minari dataset {dataset_id} ({data})"):
         if data_format != "hdf5":
             return sum(path.name.isdigit() for path in data.iterdir())
-        with h5py.File(data, "r") as file:
+        with h5py.File(existing_file(data, "an hdf5 file"), "r") as file:
             return sum(name.startswith("episode_") for name in file)
 
 
-def _flat(space: spaces.Space, source: str) -> spaces.Box:
+def _space(space: spaces.Space, keys: Sequence[str] | None, source: str) -> spaces.Space:
     try:
-        return flatten_observation_space(space)
+        return chosen_space(space, keys, source)
+    except DatasetError:
+        raise
     except ValueError as error:
         raise DatasetError(f"{source}: {error}") from error
 
@@ -260,8 +293,8 @@ def _hdf5_reader(stack: contextlib.ExitStack, folder: Path, source: str) -> Call
     def episode(index: int) -> _Episode:
         group = open_group(file, f"episode_{index}", source)
         where = f"{source}, episode {index}"
-        infos = (f"{INFOS}/{name}" for name in SUCCESS if INFOS in group)
-        told = next((name for name in infos if name in group), None)
+        infos = set(open_group(group, INFOS, where)) if INFOS in set(group) else set()
+        told = next((f"{INFOS}/{name}" for name in SUCCESS if name in infos), None)
 
         def array(*path: str | int) -> np.ndarray:
             return read_hdf5(group, "/".join(f"_index_{key}" if isinstance(key, int) else key for key in path), where)
@@ -276,9 +309,9 @@ def _arrow_reader(data_format: str, folder: Path, source: str) -> Callable[[int]
     pyarrow = import_pyarrow(source)
 
     def episode(index: int) -> _Episode:
-        files = pyarrow.dataset.dataset(
-            folder / str(index), format=data_format, ignore_prefixes=["_", ".", METADATA_FILE_NAME]
-        )
+        paths = files_below(folder, str(index))
+        found = [str(path) for path in paths if not path.name.startswith(("_", ".", METADATA_FILE_NAME))]
+        files = pyarrow.dataset.dataset(found, format=data_format)
         missing = sorted(set(EPISODE_KEYS) - set(files.schema.names))
         if missing:
             raise DatasetError(f"{source}, episode {index}: holds no {', '.join(missing)}; the file is incomplete.")
@@ -308,7 +341,12 @@ def _arrow_reader(data_format: str, folder: Path, source: str) -> Callable[[int]
 
 
 def make_trajectory(
-    read: ReadArray, success: np.ndarray | None, observation_space: spaces.Space, name: str, source: str
+    read: ReadArray,
+    success: np.ndarray | None,
+    observation_keys: Sequence[str] | None,
+    observation_space: spaces.Space,
+    name: str,
+    source: str,
 ) -> Trajectory:
     """
     One episode of a Minari file.
@@ -317,7 +355,8 @@ def make_trajectory(
         by its keys
     :param success: flags of the steps, whose last one tells of the episode, after one of its reset or not; None where
         nothing is told
-    :param observation_space: the dataset's own
+    :param observation_keys: as for :func:`load_minari`
+    :param observation_space: of what is chosen of the dataset's, sorted
     :param name: what the file calls the episode
     :param source: the file, for messages
     :raises DatasetError: one of its arrays is missing, or they differ in length
@@ -327,7 +366,7 @@ def make_trajectory(
     n_steps = len(rewards)
     if len(actions) != n_steps:
         raise DatasetError(f"{where}: holds {len(actions)} actions for {n_steps} rewards; as many are expected.")
-    columns = flatten_observations(read, ("observations",), sort_observation_space(observation_space), where)
+    columns = flatten_chosen(read, observation_keys, observation_space, where)
     counts = sorted({len(column) for column in columns})
     if len(counts) != 1 or counts[0] - n_steps not in (0, 1):
         raise DatasetError(

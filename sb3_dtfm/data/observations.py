@@ -2,16 +2,25 @@
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
 from gymnasium import spaces
 
 from sb3_dtfm.data.trajectories import DatasetError, check_real
+from sb3_dtfm.envs.return_to_go import sort_observation_space
 
+# How a JPEG image begins.
+JPEG = b"\xff\xd8\xff"
 # Gives one of an episode's arrays by its name, followed by the keys of the parts of a Dict or Tuple that lead to it.
 ReadArray: TypeAlias = Callable[..., np.ndarray]
+
+
+STORED_AS_JPEG = (
+    "hold JPEG images, as which Minari stores arrays of bytes; images cannot be used, and vectors are read if they are "
+    "recorded as another type than uint8."
+)
 
 
 def as_vectors(observations: Any, where: str) -> np.ndarray:
@@ -37,6 +46,92 @@ def as_vectors(observations: Any, where: str) -> np.ndarray:
     if len(set(lengths.values())) > 1:
         raise DatasetError(f"{where} has entries of different lengths: {lengths}.")
     return np.concatenate(list(parts.values()), axis=1)
+
+
+def in_space(observations: Any, space: spaces.Space | None, where: str) -> np.ndarray:
+    """
+    Observations as the vectors that the wrapper makes of them in an environment, which knows what is a choice.
+
+    :param observations: as for :func:`as_vectors`
+    :param space: the environment's observation space; None where nobody tells
+    :param where: whose they are, for messages
+    :return: (T, O), with a vector of zeros and a one for each Discrete number
+    :raises DatasetError: as :func:`as_vectors`, or not in the space
+    """
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        if not isinstance(observations, Mapping):
+            return as_vectors(observations, where)
+        parts: dict[Any, spaces.Space] = dict(space.spaces if isinstance(space, spaces.Dict) else enumerate(space.spaces))
+        missing = sorted(str(key) for key in parts if key not in observations)
+        if missing:
+            there = ", ".join(map(str, observations))
+            raise DatasetError(f"{where} has no {', '.join(missing)}, which the environment observes, only {there}.")
+        return np.concatenate([in_space(observations[key], parts[key], f"{where}, {key}") for key in sorted(parts)], axis=1)
+    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete) and not isinstance(observations, Mapping):
+        array = np.asarray(observations)
+        if array.shape[1:] in (space.shape, (math.prod(space.shape or ()),)):
+            return flatten_observations(lambda *_: array, (), space, where)[0]
+    return as_vectors(observations, where)
+
+
+def chosen(observations: Any, keys: Sequence[str], space: spaces.Space | None, where: str) -> np.ndarray:
+    """
+    Some entries of dictionary observations side by side, in the order of their keys.
+
+    :param observations: a dictionary, as for :func:`in_space`
+    :param keys: of the entries
+    :param space: the environment's observation space, or None
+    :param where: whose they are, for messages
+    :return: (T, O)
+    :raises DatasetError: as :func:`in_space`, or there is no such entry
+    """
+    if not isinstance(observations, Mapping):
+        raise DatasetError(f"{where} is no dictionary, of which observation_keys could choose {', '.join(keys)}.")
+    parts = []
+    for key in keys:
+        if key not in observations:
+            raise DatasetError(f"{where} has no {key!r}, only {', '.join(map(str, observations))}.")
+        parts.append(in_space(observations[key], part_of(space, key), f"{where}, {key}"))
+    return np.concatenate(parts, axis=1)
+
+
+def part_of(space: spaces.Space | None, key: str) -> spaces.Space | None:
+    """The space of an entry of dictionary observations, where it is known."""
+    return space.spaces.get(key) if isinstance(space, spaces.Dict) else None
+
+
+def chosen_space(space: spaces.Space, keys: Sequence[str] | None, source: str) -> spaces.Space:
+    """
+    The observation space that is left of a dataset's own one.
+
+    :param space: of the dataset
+    :param keys: of a Dict's entries, in this order; None for all of the space
+    :param source: for messages
+    :raises DatasetError: no Dict, or no such entry
+    """
+    if keys is None:
+        return sort_observation_space(space)
+    there = space.spaces if isinstance(space, spaces.Dict) else {}
+    missing = [key for key in keys if key not in there]
+    if missing or not keys:
+        found = f"entries {', '.join(sorted(there))}" if there else f"no entries, but {space}"
+        raise DatasetError(f"{source}: observation_keys is {list(keys)}; the observations have {found}.")
+    return sort_observation_space(spaces.Tuple([there[key] for key in keys]))
+
+
+def flatten_chosen(read: ReadArray, keys: Sequence[str] | None, space: spaces.Space, where: str) -> list[np.ndarray]:
+    """
+    As :func:`flatten_observations`, of the entries that were chosen.
+
+    :param keys: as for :func:`chosen_space`
+    :param space: what :func:`chosen_space` has made of the dataset's
+    """
+    if keys is None:
+        return flatten_observations(read, ("observations",), space, where)
+    assert isinstance(space, spaces.Tuple)
+    parts = zip(keys, space.spaces, strict=True)
+    columns = (flatten_observations(read, ("observations", key), part, where) for key, part in parts)
+    return list(itertools.chain.from_iterable(columns))
 
 
 def check_no_images(array: np.ndarray, where: str) -> None:
@@ -69,6 +164,8 @@ def flatten_observations(read: ReadArray, path: tuple[str | int, ...], space: sp
     values, name = read(*path), "/".join(map(str, path))
     check_real(values.dtype, f"{where}: {name}")
     size = math.prod(space.shape or ())
+    if values.dtype == np.uint8 and values.ndim == 2 and values[:1, :3].tobytes() == JPEG and size != values.shape[1]:
+        raise DatasetError(f"{where}: {name} {STORED_AS_JPEG}")
     if values.shape[1:] not in (space.shape, (size,)):
         raise DatasetError(
             f"{where}: {name} have shape {values.shape}, expected (steps, {', '.join(map(str, space.shape or ()))})."

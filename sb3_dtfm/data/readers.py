@@ -7,17 +7,27 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
+from gymnasium import spaces
 from minari import MinariDataset
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_dtfm.actions import ActionSpace
-from sb3_dtfm.arguments import POSITIVE, with_nearest
+from sb3_dtfm.arguments import BOOLEAN, POSITIVE, Number, Rule, check_arguments, with_nearest
+from sb3_dtfm.data.arrays import is_table
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, load_cached
 from sb3_dtfm.data.flat import fingerprint_flat_file, is_flat_file, is_mapping, load_flat
-from sb3_dtfm.data.in_memory import is_episodes, is_replay_buffer, load_episodes, load_replay_buffer
+from sb3_dtfm.data.in_memory import (
+    is_episodes,
+    is_replay_buffer,
+    is_steps,
+    load_episodes,
+    load_replay_buffer,
+    load_steps,
+)
 from sb3_dtfm.data.lerobot import fingerprint_lerobot, is_lerobot, load_lerobot
 from sb3_dtfm.data.minari import fingerprint_minari, is_minari, load_minari
+from sb3_dtfm.data.pickles import unpickled, without_pickles
 from sb3_dtfm.data.robomimic import fingerprint_robomimic, is_robomimic, load_robomimic
 from sb3_dtfm.data.trajectories import DatasetError
 
@@ -27,9 +37,17 @@ Dataset: TypeAlias = (
 )
 # What load_dataset itself does with a dataset of any kind.
 COMMON_OPTIONS = (
-    *("env_id", "action_space", "max_episode_steps"),
-    *("min_return", "best_share", "success_only", "fraction", "fraction_seed"),
+    *("env_id", "action_space", "observation_space", "max_episode_steps", "min_return", "best_share"),
+    *("success_only", "fraction", "fraction_seed", "allow_pickle"),
 )
+# What some of the options may be, where their readers do not look.
+ACCEPTED: dict[str, Rule] = {
+    "clip_actions": BOOLEAN,
+    "success_only": BOOLEAN,
+    "allow_pickle": BOOLEAN,
+    "min_return": Number(optional=True),
+    "max_episode_steps": Number(low=1, whole=True, optional=True),
+}
 
 
 class Reader(NamedTuple):
@@ -62,26 +80,31 @@ def _is_one_of_several(dataset: Any) -> bool:
 def load_several(
     datasets: Sequence[Any],
     action_space: ActionSpace | None = None,
+    observation_space: spaces.Space | None = None,
     env_id: str | None = None,
     max_episode_steps: int | None = None,
+    allow_pickle: bool = False,
 ) -> TrajectoryBuffer:
     """
     Several datasets of one task as one, in memory.
 
     :param datasets: anything that :func:`load_dataset` takes, or `{"dataset": it, "weight": 2.0, ...}` with its other
         arguments; a step of one of weight 2 is learned from twice as often as one of weight 1
-    :param action_space: see :func:`load_dataset`; like the next two it counts for each that has none of its own
+    :param action_space: see :func:`load_dataset`; like the next ones it counts for each that has none of its own
+    :param observation_space: see :func:`load_dataset`
     :param env_id: see :func:`load_dataset`
     :param max_episode_steps: see :func:`load_dataset`
+    :param allow_pickle: see :func:`load_dataset`
     :raises DatasetError: one of them cannot be read, or is of another task; a weight that is no positive number
     """
     buffers, weights = [], []
     for each in datasets:
-        options = dict(each) if is_mapping(each) else {"dataset": each}
+        options = without_pickles(each) if is_mapping(each) else {"dataset": each}
         dataset, weight = options.pop("dataset"), options.pop("weight", 1.0)
         if not POSITIVE.accepts(weight):
             raise DatasetError(f"dataset {dataset!s}: weight is {weight!r}; a positive number is accepted.")
-        shared = {"action_space": action_space, "env_id": env_id, "max_episode_steps": max_episode_steps}
+        shared: dict[str, Any] = {"action_space": action_space, "observation_space": observation_space, "env_id": env_id}
+        shared.update(max_episode_steps=max_episode_steps, allow_pickle=allow_pickle)
         buffers.append(load_dataset(dataset, **{**shared, **options}))
         weights.append(float(weight))
     return TrajectoryBuffer.join(buffers, weights)
@@ -89,12 +112,19 @@ def load_several(
 
 # The first one that accepts a dataset reads it.
 READERS = (
-    Reader("the path of a file of flat arrays (.npz, .hdf5)", is_flat_file, load_flat, fingerprint_flat_file),
+    Reader(
+        "the path of a file of flat arrays (.npz, .hdf5) or of a table (.csv, .parquet)",
+        is_flat_file,
+        load_flat,
+        fingerprint_flat_file,
+    ),
     Reader("the path of a LeRobot dataset (a folder)", is_lerobot, load_lerobot, fingerprint_lerobot),
     Reader("the path of a robomimic file (.hdf5)", is_robomimic, load_robomimic, fingerprint_robomimic),
     Reader("a Minari id (namespace/name-vN) or MinariDataset", is_minari, load_minari, fingerprint_minari),
     Reader("a dictionary of flat arrays", is_mapping, load_flat, None),
+    Reader("a DataFrame", is_table, load_flat, None),
     Reader("a list of datasets", is_several, load_several, None),
+    Reader("a list of steps", is_steps, load_steps, None),
     Reader("a list of episodes", is_episodes, load_episodes, None),
     Reader("an SB3 ReplayBuffer", is_replay_buffer, load_replay_buffer, None),
     Reader("a TrajectoryBuffer", lambda dataset: isinstance(dataset, TrajectoryBuffer), lambda dataset: dataset, None),
@@ -106,12 +136,14 @@ def load_dataset(
     cache_dir: str | os.PathLike[str] | None = None,
     env_id: str | None = None,
     action_space: ActionSpace | None = None,
+    observation_space: spaces.Space | None = None,
     max_episode_steps: int | None = None,
     min_return: float | None = None,
     best_share: float | None = None,
     success_only: bool = False,
     fraction: float = 1.0,
     fraction_seed: int = 0,
+    allow_pickle: bool = False,
     **kwargs: Any,
 ) -> TrajectoryBuffer:
     """
@@ -125,6 +157,8 @@ def load_dataset(
         the first call and whenever the dataset has changed. None reads everything into memory
     :param env_id: Gymnasium id of the environment that the episodes count as coming from, whatever the dataset says
     :param action_space: the environment's, for data that do not tell of a range of actions
+    :param observation_space: the environment's, for data that do not tell what is a choice: a Discrete part becomes a vector
+        of zeros and a one, as :class:`~sb3_dtfm.envs.ReturnToGoWrapper` shows it
     :param max_episode_steps: leave out what episodes hold beyond so many steps, with a warning; see
         :meth:`TrajectoryBuffer.within`. None keeps all
     :param min_return: leave out episodes of a smaller return, environment reward units
@@ -133,12 +167,17 @@ def load_dataset(
         :attr:`TrajectoryBuffer.successes`
     :param fraction: keep this share of the episodes, randomly drawn
     :param fraction_seed: of that draw alone, so that different runs learn from the same episodes
+    :param allow_pickle: read pickles, which can run code: files of SB3's replay buffers (`.pkl`), and arrays of objects in
+        `.npz`; not accepted from `dataset_kwargs`, which files of others may hold
     :param kwargs: options of the reader: `on_invalid`, which is "raise" unless "drop" leaves episodes out that would be
         refused, with a warning that names their number and the first reason; `filter_key` and `observation_keys` for
         robomimic files, see also :func:`load_flat`
     :raises DatasetError: `dataset` is nothing of the above, its reader refuses it, or its cache cannot be used
     :raises TypeError: the reader has no such option
     """
+    named = {"cache_dir": cache_dir, "env_id": env_id, "max_episode_steps": max_episode_steps, "min_return": min_return}
+    _check_options({**kwargs, **named, "success_only": success_only, "allow_pickle": allow_pickle})
+    dataset = unpickled(dataset, allow_pickle)
     reader = _find_reader(dataset)
     parameters = inspect.signature(reader.load).parameters
     own = [name for name in parameters if name not in ("storage", *COMMON_OPTIONS)][1:]
@@ -146,11 +185,12 @@ def load_dataset(
     accepted = [*own, *(["cache_dir"] if reader.fingerprint else []), *COMMON_OPTIONS]
     unknown = sorted(set(given) - set(accepted))
     if unknown:
-        name = reader.kind if is_mapping(dataset) or is_episodes(dataset) else str(dataset)
+        name = reader.kind if is_mapping(dataset) or is_episodes(dataset) or is_table(dataset) else str(dataset)
         raise TypeError(
             f"dataset {name}: unknown option {with_nearest(unknown, accepted)}; accepted: {', '.join(accepted)}."
         )
-    common = {"action_space": action_space, "env_id": env_id, "max_episode_steps": max_episode_steps}
+    common: dict[str, Any] = {"action_space": action_space, "observation_space": observation_space, "env_id": env_id}
+    common.update(max_episode_steps=max_episode_steps, allow_pickle=allow_pickle)
     kwargs.update((name, value) for name, value in common.items() if name in parameters)
     if cache_dir is None or reader.fingerprint is None:
         buffer = reader.load(dataset, **kwargs)
@@ -165,6 +205,25 @@ def load_dataset(
     if max_episode_steps is not None:
         buffer = buffer.within(max_episode_steps)
     return buffer.best(min_return, best_share, success_only).random_fraction(fraction, fraction_seed)
+
+
+def _check_options(given: dict[str, Any]) -> None:
+    """
+    :param given: values by name
+    :raises ValueError: names the option, what was given and what is accepted
+    """
+    check_arguments(given, {name: rule for name, rule in ACCEPTED.items() if name in given})
+    for name in ("cache_dir", "env_id"):
+        value = given[name]
+        kinds = str if name == "env_id" else (str, os.PathLike)
+        if value is not None and not (isinstance(value, kinds) and str(value)):
+            expected = "the path of a folder" if name == "cache_dir" else "the id of an environment"
+            raise ValueError(f"{name} must be {expected}, or None, got {value!r}.")
+    for name in ("observation_keys", "action_keys"):
+        value = given.get(name)
+        names = isinstance(value, Sequence) and not isinstance(value, str) and all(isinstance(each, str) for each in value)
+        if value is not None and not (names and value):
+            raise ValueError(f"{name} must be a list of names, or None, got {value!r}.")
 
 
 def _find_reader(dataset: Any) -> Reader:

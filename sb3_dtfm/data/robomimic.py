@@ -1,9 +1,11 @@
 """Reading robomimic's hdf5 files into a `TrajectoryBuffer`."""
 
+import contextlib
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import h5py
@@ -12,10 +14,11 @@ from gymnasium import spaces
 
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, existing_file
-from sb3_dtfm.data.hdf5 import listed, open_group, open_hdf5, read_hdf5
+from sb3_dtfm.data.flat import fitted, warn_of_made_up_rewards
+from sb3_dtfm.data.hdf5 import check_within, listed, open_group, open_hdf5, read_hdf5
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_finite, check_flags, wrap_dataset_errors
-from sb3_dtfm.envs.robosuite import env_id_from_robomimic
+from sb3_dtfm.envs.robosuite import arm_controller, differences_from_robomimic, env_id_from_robomimic
 
 DEFAULT_OBSERVATION_KEYS = ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos", "object")
 EXPECTED = "the path of a robomimic hdf5 file"
@@ -38,16 +41,32 @@ def fingerprint_robomimic(path: str | os.PathLike[str], options: dict[str, Any])
 
     :param path: the file
     :param options: of :func:`load_robomimic`
-    :raises DatasetError: no such file
+    :raises DatasetError: no such file, or one of another robot or controller, see :func:`load_robomimic`
     """
+    options = dict(options)
+    meant_for = options.pop("env_id", None)  # which a cache does not hold
+    with _opened(path) as (file, source):
+        if "data" in set(file):
+            _env_id(_env_args(open_group(file, "data", source), source), source, meant_for)
+    return Fingerprint.of(Path(source).name, Path(source), options)
+
+
+@contextlib.contextmanager
+def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[h5py.File, str]]:
+    """While it is read, and what it is called."""
     path = existing_file(path, EXPECTED)
-    return Fingerprint.of(path.name, path, options)
+    if not h5py.is_hdf5(path):
+        raise DatasetError(f"{path}: not an hdf5 file; a robomimic hdf5 file is expected.")
+    with wrap_dataset_errors(str(path)), h5py.File(path, "r") as file:
+        yield file, str(path)
 
 
 def load_robomimic(
     path: str | os.PathLike[str],
     filter_key: str | None = None,
     observation_keys: Sequence[str] | None = None,
+    clip_actions: bool = False,
+    env_id: str | None = None,
     on_invalid: str = "raise",
     storage: FileStorage | None = None,
 ) -> TrajectoryBuffer:
@@ -67,18 +86,18 @@ def load_robomimic(
     :param filter_key: read only the demonstrations listed in `mask/<filter_key>`, such as "train"
     :param observation_keys: which of a demonstration's `obs` make up the observation, in this order; robomimic's
         low-dimensional ones by default
+    :param clip_actions: bring actions outside of the controller's input range to the nearest bound
+    :param env_id: the environment that the file's actions are meant for; not given, it is ours of the file's task, and a
+        file of another robot or controller is refused
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
     :param storage: where the steps go, memory if not given
     :return: actions in the controller's input range, [-1, 1] if the file says nothing else
     :raises DatasetError: no such file, not readable, nothing in it, unknown keys, wrong shapes, NaN or infinity, or actions
         out of range; names the file, the demonstration and the step
     """
-    path = existing_file(path, EXPECTED)
-    source = str(path)
-    if not h5py.is_hdf5(path):
-        raise DatasetError(f"{source}: not an hdf5 file; a robomimic hdf5 file is expected.")
-    with wrap_dataset_errors(source), h5py.File(path, "r") as file:
-        return _read(file, source, filter_key, tuple(observation_keys or DEFAULT_OBSERVATION_KEYS), on_invalid, storage)
+    keys = tuple(observation_keys or DEFAULT_OBSERVATION_KEYS)
+    with _opened(path) as (file, source):
+        return _read(file, source, filter_key, keys, clip_actions, env_id, on_invalid, storage)
 
 
 class _Labels(NamedTuple):
@@ -95,6 +114,8 @@ def _read(
     source: str,
     filter_key: str | None,
     observation_keys: tuple[str, ...],
+    clip_actions: bool,
+    env_id: str | None,
     on_invalid: str,
     storage: FileStorage | None,
 ) -> TrajectoryBuffer:
@@ -116,6 +137,13 @@ def _read(
     if not refused:
         _check_count(data, "total", sum(demo.n_steps for demo in labels.values()), source)
     rewards = _rewards(labels)
+    if not any(demo.rewards is not None and demo.rewards.any() for demo in labels.values()):
+        warn_of_made_up_rewards((), source)
+    env_id = _env_id(env_args, source, env_id)
+    n_actions = next((labels[name].n_actions for name in demos if name in labels), None)
+    if n_actions is None:
+        raise refused[demos[0]]
+    action_space = _action_space(env_args, n_actions, source)
 
     def trajectory(name: str) -> Trajectory:
         if name in refused:
@@ -128,7 +156,7 @@ def _read(
             done = dones is not None and bool(dones[length - 1])
             return Trajectory(
                 observations=_present_object_state(observations, observation_keys, env_args)[:length],
-                actions=read_hdf5(groups[name], "actions", where)[:length],
+                actions=fitted(read_hdf5(groups[name], "actions", where)[:length], action_space, clip_actions),
                 rewards=rewards[name],
                 terminated=success,
                 truncated=done and not success,
@@ -136,14 +164,9 @@ def _read(
                 name=name,
             )
 
-    with wrap_dataset_errors(f"{source}: attribute 'env_args' of group 'data'"):
-        env_id = env_id_from_robomimic(env_args)
-    n_actions = next((labels[name].n_actions for name in demos if name in labels), None)
-    if n_actions is None:
-        raise refused[demos[0]]
     return TrajectoryBuffer.from_trajectories(
         map(trajectory, demos),
-        action_space=_action_space(env_args, n_actions, source),
+        action_space=action_space,
         n_steps=sum(len(rewards[name]) for name in demos if name in rewards),
         source=source,
         env_id=env_id,
@@ -160,9 +183,10 @@ def _number(name: str) -> tuple[int, str]:
 
 
 def _filtered(file: h5py.File, source: str, filter_key: str, demos: list[str]) -> list[str]:
-    masks = file.get("mask", {})
-    if filter_key not in masks:
+    masks = open_group(file, "mask", source) if "mask" in set(file) else {}
+    if filter_key not in set(masks):
         raise DatasetError(f"{source}: has no filter key {filter_key!r}; available: {listed(masks)}.")
+    check_within(masks, filter_key, f"{source}: mask")
     chosen = np.asarray(masks[filter_key][()]).reshape(-1).tolist()
     names = [name.decode() if isinstance(name, bytes) else str(name) for name in chosen]
     missing = sorted(set(names) - set(demos), key=_number)
@@ -177,6 +201,20 @@ def _env_args(data: h5py.Group, source: str) -> dict[str, Any]:
     with wrap_dataset_errors(f"{source}: attribute 'env_args' of group 'data' is not JSON"):
         env_args = json.loads(data.attrs.get("env_args", "{}"))
     return env_args if isinstance(env_args, dict) else {}
+
+
+def _env_id(env_args: dict[str, Any], source: str, meant_for: str | None) -> str | None:
+    """Our environment of the file's task; if none is named that the file is meant for, its actions have to do the same."""
+    with wrap_dataset_errors(f"{source}: attribute 'env_args' of group 'data'"):
+        env_id = env_id_from_robomimic(env_args)
+        differences = {} if env_id is None else differences_from_robomimic(env_args)
+    if differences and meant_for is None:
+        found = ", ".join(f"{name} is {theirs!r} instead of {ours!r}" for name, (theirs, ours) in differences.items())
+        raise DatasetError(
+            f"{source}: an action does something else than in {env_id}: {found}. For an environment with these "
+            "settings (sb3_dtfm.envs.robosuite.env_kwargs_from_robomimic) give its id, dataset_kwargs={'env_id': ...}."
+        )
+    return env_id
 
 
 def _check_count(group: h5py.Group, name: str, n_steps: int, where: str) -> None:
@@ -285,9 +323,7 @@ def _in_frame(vectors: np.ndarray, quaternions: np.ndarray) -> np.ndarray:
 def _action_space(env_args: dict[str, Any], n_actions: int, source: str) -> spaces.Box:
     """The controller's input range for the arm, [-1, 1] for the gripper and where the file says nothing."""
     with wrap_dataset_errors(f"{source}: attribute 'env_args' of group 'data'"):
-        config = env_args.get("env_kwargs", {}).get("controller_configs") or {}
-        config = config[0] if isinstance(config, list) else config
-        arm = config.get("body_parts", {}).get("right", config)
+        arm = arm_controller(env_args.get("env_kwargs", {}))
         if arm.get("input_type", "delta") != "delta" or arm.get("control_delta", True) is False:
             raise DatasetError(f"{source}: actions are absolute poses; only files with a delta controller are accepted.")
         low, high = -np.ones(n_actions, np.float32), np.ones(n_actions, np.float32)

@@ -28,6 +28,10 @@ class DatasetError(ValueError):
     """A dataset cannot be used. The message names the file, episode and step, what was found and what is accepted."""
 
 
+class ActionRangeError(DatasetError):
+    """An action lies outside of the action space."""
+
+
 @contextlib.contextmanager
 def wrap_dataset_errors(where: str, why: str = "the file is damaged or incomplete, or cut off") -> Iterator[None]:
     """
@@ -276,7 +280,7 @@ def _check_inside(actions: np.ndarray, space: spaces.Box, where: str) -> None:
     if not ((actions >= low).all() and (actions <= high).all()):
         outside = (actions < low) | (actions > high)
         step, dimension = (int(i) for i in np.argwhere(outside)[0])
-        raise DatasetError(
+        raise ActionRangeError(
             f"{where}, step {step}: action {actions[step, dimension]:g} in dimension {dimension} lies outside of "
             f"the action space [{space.low[dimension]:g}, {space.high[dimension]:g}]."
         )

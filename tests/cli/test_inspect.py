@@ -2,9 +2,11 @@
 
 import shlex
 
+import gymnasium
 import numpy as np
 import pytest
 
+import sb3_dtfm
 from sb3_dtfm.cli.main import main
 from sb3_dtfm.data import load_dataset
 from sb3_dtfm.data.inspection import inspect_buffer
@@ -120,3 +122,36 @@ def test_what_lies_behind_the_task_s_time_limit_is_not_counted(workplace, capsys
     assert "| episodes | 1: " in capsys.readouterr().out, "of 250 steps three episodes had such a return"
     assert main(["inspect", "long.npz", "--dataset-kwargs", "max_episode_steps:None"]) == 0
     assert "an episode has 250 to 250" in capsys.readouterr().out
+
+
+def pendulum_arrays():
+    rng = np.random.default_rng(0)
+    n = 20
+    return {
+        "obs": rng.normal(size=(n, 3)),
+        "action": rng.uniform(-2, 2, (n, 1)),
+        "reward": np.ones(n),
+        "done": np.arange(n) % 5 == 4,
+    }
+
+
+def test_the_environment_tells_of_the_range_of_actions(workplace, capsys):
+    np.savez("swings.npz", **pendulum_arrays())
+    assert main(["inspect", "swings.npz"]) != 0
+    assert "Give an environment (inspect: --env ID), or action_bounds=(smallest, largest)" in capsys.readouterr().err
+    assert main(["inspect", "swings.npz", "--env", "Pendulum-v1"]) == 0
+    text = capsys.readouterr().out
+    low, high = (getattr(pendulum_arrays()["obs"][:, 1], name)() for name in ("min", "max"))
+    assert f"| observation 1 | {low:.4g} to {high:.4g}, " in text
+    assert "--env Pendulum-v1 --dataset swings.npz" in text
+    loading = text.split("To load it in Python:\n")[1].splitlines()[0]
+    buffer = eval(loading, {"gymnasium": gymnasium, "sb3_dtfm": sb3_dtfm})
+    assert (buffer.action_space.high[0], buffer.n_episodes) == (2.0, 4)
+
+
+def test_data_of_another_environment_are_refused(workplace, capsys):
+    np.savez("swings.npz", **pendulum_arrays())
+    assert main(["inspect", "swings.npz", "--env", "MountainCarContinuous-v0", "--dataset-kwargs", "clip_actions:True"]) != 0
+    found = capsys.readouterr().err
+    assert "swings.npz holds observations of shape (3,) and actions of Box(-1.0, 1.0" in found
+    assert "those of MountainCarContinuous-v0 are (2,)" in found

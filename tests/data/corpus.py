@@ -3,9 +3,11 @@
 import itertools
 import json
 import math
+import os
 import shutil
 import warnings
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -97,6 +99,20 @@ def write_good(folder: Path, monkeypatch: Any) -> None:
         for name, array in flat_arrays().items():
             file[name] = array
     write_lerobot(folder / "lerobot" / "arm")
+    for kind in ("csv", "table"):
+        (folder / kind).mkdir()
+    columns = table_columns()
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    lines = [",".join(columns), *(",".join(map(repr, row)) for row in rows)]
+    (folder / "csv" / "set.csv").write_text("\n".join(lines))
+    pyarrow.parquet.write_table(pa.table(columns), folder / "table" / "set.parquet")
+
+
+def table_columns() -> dict[str, np.ndarray]:
+    arrays = flat_arrays()
+    columns = {f"obs_{i}": column for i, column in enumerate(arrays["observations"].T)}
+    columns |= {f"action_{i}": column for i, column in enumerate(arrays["actions"].T)}
+    return {**columns, "reward": arrays["rewards"], "episode": np.repeat(np.arange(len(LENGTHS)), LENGTHS)}
 
 
 def write_lerobot(folder: Path) -> None:
@@ -222,6 +238,50 @@ def unwritten(file: h5py.File, path: str, folder: Path) -> None:
     replace(file, path, lambda array: file.create_dataset(path, array.shape, array.dtype))
 
 
+def pipe(folder: Path) -> str:
+    """What nobody writes to, so that whoever opens it waits for ever."""
+    os.mkfifo(folder / "pipe")
+    return str(folder / "pipe")
+
+
+def link_through_pipe(file: h5py.File, path: str, folder: Path) -> None:
+    del file[path]
+    file["/elsewhere"] = h5py.ExternalLink(pipe(folder), "/")
+    file[path] = h5py.SoftLink("/elsewhere/array")
+
+
+def virtual_over_pipe(file: h5py.File, path: str, folder: Path) -> None:
+    """Of as many rows as the other file has."""
+    array = file[path][()]
+    del file[path]
+    shapes = dict(shape=array.shape, maxshape=(None, *array.shape[1:]))
+    layout, everything = h5py.VirtualLayout(dtype=array.dtype, **shapes), slice(0, h5py.h5s.UNLIMITED)
+    layout[everything] = h5py.VirtualSource(str(folder / "pipe"), "array", dtype=array.dtype, **shapes)[everything]
+    file.create_virtual_dataset(path, layout)
+    file.flush()
+    pipe(folder)
+
+
+def some_chunks(file: h5py.File, path: str, folder: Path) -> None:
+    array = file[path][()]
+    del file[path]
+    data = file.create_dataset(path, array.shape, array.dtype, chunks=(2, *array.shape[1:]), fillvalue=0)
+    data[:4] = array[:4]
+
+
+def short_chunk(compression: str | None) -> Callable[[h5py.File, str, Path], object]:
+    """One chunk has a byte of its many."""
+
+    def change(file: h5py.File, path: str, folder: Path) -> None:
+        array = file[path][()]
+        del file[path]
+        chunks = (2, *array.shape[1:])
+        data = file.create_dataset(path, data=array, chunks=chunks, compression=compression)
+        data.id.write_direct_chunk((0,) * array.ndim, zlib.compress(b"1") if compression else b"1")
+
+    return change
+
+
 def linked(file: h5py.File, path: str, folder: Path) -> None:
     file.move(path, "/elsewhere")
     file[path] = h5py.SoftLink("/elsewhere")
@@ -235,6 +295,12 @@ HDF5: dict[str, tuple[Callable[[h5py.File, str, Path], object], str | None]] = {
     "link to another file": (put(lambda folder, array: h5py.ExternalLink(str(folder / "other.hdf5"), "array")), None),
     "link to no file": (put(lambda folder, array: h5py.ExternalLink("/none.hdf5", "array")), None),
     "link to a device": (put(lambda folder, array: h5py.ExternalLink("/dev/zero", "array")), None),
+    "link to a pipe": (put(lambda folder, array: h5py.ExternalLink(pipe(folder), "array")), None),
+    "link through a pipe": (link_through_pipe, None),
+    "virtual over a pipe": (virtual_over_pipe, None),
+    "some chunks unwritten": (some_chunks, None),
+    "a short chunk": (short_chunk(None), None),
+    "a short compressed chunk": (short_chunk("gzip"), None),
     "storage in another file": (external_storage, None),
     "virtual": (virtual, None),
     "unwritten": (unwritten, None),
@@ -506,6 +572,7 @@ NO_STRINGS: dict[str, Any] = {
     "an object": {},
     "true": True,
 }
+OLD = ("data_format", "missing")  # as in Minari's first versions
 NO_COUNTS: dict[str, Any] = {"missing": MISSING, "null": None, "a word": "3", "a fraction": 3.5, "negative": -1,
                              "true": True, "NaN": math.nan, "infinite": math.inf, "huge": SPARSE, "beyond 64 bits": 2**70,
                              "one more": "+1", "one less": "-1", "none": 0, "a list": [3]}  # fmt: skip
@@ -562,7 +629,8 @@ def metadata_cases() -> Iterator[Case]:
         return Case(f"metadata, {field}: {name}", "hdf5", metadata_change(**{field: value}), MINARI_ID, words)
 
     for field in ("dataset_id", "minari_version", "data_format", "observation_space", "action_space"):
-        yield from (case(name, value, field) for name, value in NO_STRINGS.items())
+        yield from (case(name, value, field) for name, value in NO_STRINGS.items() if (field, name) != OLD)
+    yield case("missing", MISSING, "data_format")._replace(expected=SAME)
     for field, right in {"total_episodes": len(LENGTHS), "total_steps": N_STEPS}.items():
         for name, value in NO_COUNTS.items():
             yield case(name, right + int(value) if value in ("+1", "-1") else value, field)
@@ -716,6 +784,7 @@ def group_cases() -> Iterator[Case]:  # noqa: C901 (a list)
 
     for kind, path, name in (("hdf5", "episode_1", "main_data"), ("robomimic", "data/demo_1", "set.hdf5")):
         yield case(kind, "an episode in another file", path, away, name, path[-6:])
+        yield case(kind, "an episode behind a pipe", path, link_through_pipe, name, path[-6:])
         yield case(kind, "an episode that links into nothing", path, link(h5py.SoftLink("/nowhere")), name, path[-6:])
         yield case(kind, "an episode that links to itself", path, link_to_itself, name, path[-6:])
         yield case(
@@ -729,6 +798,7 @@ def group_cases() -> Iterator[Case]:  # noqa: C901 (a list)
     yield case("hdf5", "an episode of another name", "episode_1", move("/episode_one"), "main_data", "episode_1")
     yield case("hdf5", "no episode", "episode_0", lambda f, p, folder: f.clear(), "total_episodes", "0")
     yield case("robomimic", "no demonstration", "data", lambda f, p, folder: f[p].clear(), "set.hdf5", "no demonstration")
+    yield case("robomimic", "a mask behind a pipe", "mask/train", link_through_pipe, SAME)
     yield case("robomimic", "no data", "data", lambda f, p, folder: f.__delitem__(p), "set.hdf5", "data")
     yield case("robomimic", "an array for data", "data", link(np.zeros(3)), "set.hdf5", "data")
     yield case("robomimic", "data in another file", "data", away, "set.hdf5", "data")

@@ -415,12 +415,30 @@ def test_bounds_that_are_given_and_the_environments_have_caches_of_their_own(tmp
 
 
 def test_files_behind_a_linked_folder_are_known_and_a_circle_is_not_walked_for_ever(tmp_path: Path):
-    (tmp_path / "disk").mkdir()
-    (tmp_path / "disk" / "a.bin").write_text("1")
-    (tmp_path / "data").mkdir()
-    (tmp_path / "data" / "linked").symlink_to(tmp_path / "disk")
-    (tmp_path / "disk" / "back").symlink_to(tmp_path / "data")
-    assert files_below(tmp_path / "data") == [tmp_path / "data" / "linked" / "a.bin"]
-    before = Fingerprint.of("data", tmp_path / "data", {})
-    (tmp_path / "disk" / "a.bin").write_text("12")
-    assert Fingerprint.of("data", tmp_path / "data", {}).state != before.state
+    data, disk = tmp_path / "data", tmp_path / "data" / "disk"
+    disk.mkdir(parents=True)
+    (disk / "a.bin").write_text("1")
+    (data / "b.bin").symlink_to(disk / "a.bin")
+    (disk / "back").symlink_to(data)
+    (tmp_path / "linked").symlink_to(data)
+    assert files_below(tmp_path / "linked") == [tmp_path / "linked" / "b.bin", tmp_path / "linked" / "disk" / "a.bin"]
+    before = Fingerprint.of("data", data, {})
+    (disk / "a.bin").write_text("12")
+    assert Fingerprint.of("data", data, {}).state != before.state
+
+
+@pytest.mark.parametrize("link", ["data", "data/x", "data/x.bin"])
+def test_a_link_that_leads_out_of_a_dataset_is_not_followed(link: str, tmp_path: Path):
+    """A hub's snapshot links to the hub's blobs."""
+    snapshot, blob = tmp_path / "snapshots" / "1", tmp_path / "blobs" / "a"
+    for file in (blob, tmp_path / "other" / "a", snapshot / "data" / "a.bin"):
+        file.parent.mkdir(parents=True)
+        file.write_text("1")
+    (snapshot / "data" / "b.bin").symlink_to("../../../blobs/a")
+    assert len(files_below(snapshot, "data")) == 2
+    if link == "data":
+        shutil.rmtree(snapshot / "data")
+    (snapshot / link).symlink_to(tmp_path / "other" / ("a" if link.endswith("bin") else ""))
+    for part in ("", "data"):
+        with pytest.raises(DatasetError, match=f"{link} leads to .*other.*; links within .*snapshots/1 are accepted"):
+            files_below(snapshot, part)

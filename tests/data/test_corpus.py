@@ -12,7 +12,13 @@ from sb3_dtfm.data import DatasetError, TrajectoryBuffer, load_dataset
 from sb3_dtfm.data.storage import STEP_ARRAYS
 from tests.data import corpus
 
-GOOD = {"npz": "set.npz", "robomimic": "set.hdf5", **dict.fromkeys(("hdf5", "arrow", "parquet"), corpus.MINARI_ID)}
+GOOD = {
+    "npz": "set.npz",
+    "csv": "set.csv",
+    "table": "set.parquet",
+    "robomimic": "set.hdf5",
+    **dict.fromkeys(("hdf5", "arrow", "parquet"), corpus.MINARI_ID),
+}
 CASES = corpus.cases()
 
 

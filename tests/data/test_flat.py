@@ -1,5 +1,7 @@
 """Flat arrays in one file: what is read, and what is refused."""
 
+import warnings
+
 import gymnasium as gym
 import h5py
 import numpy as np
@@ -58,8 +60,53 @@ def test_episodes_are_what_was_written(changes, path):
     assert buffer.terminated.tolist() == [True, False, False] if "terminals" in changes else [False] * 3
 
 
+NUMBERED = {
+    "numbers": dict(episode=np.repeat([4, 0, 7], [2, 3, 4])),
+    "ids": dict(episode_ids=np.repeat([1, 2, 1000], [2, 3, 4])[:, None]),
+    "dones": dict(dones=flags(1, 4, 8)),
+    "dones and timeouts": dict(done=flags(1, 4, 8), timeouts=flags(4)),
+}
+
+
+@pytest.mark.parametrize("kind", NUMBERED)
+def test_numbers_and_dones_tell_of_episodes(kind, path):
+    buffer = load_dataset(write(path, episode_ends=None, **NUMBERED[kind]))
+    assert buffer.episode_lengths.tolist() == [2, 3, 4]
+    assert buffer.terminated.tolist() == ["done" in kind, kind == "dones", "done" in kind]
+    assert buffer.truncated.tolist() == [False, kind == "dones and timeouts", False]
+
+
+def test_a_number_that_comes_again_is_no_episode(path):
+    with pytest.raises(DatasetError, match=r"episode 4 comes in several places; .* after a stable sort"):
+        load_dataset(write(path, episode_ends=None, episode=np.array([4, 4, 5, 5, 5, 4, 4, 4, 4])))
+
+
+def test_of_dones_those_at_the_time_limit_are_truncated(path):
+    buffer = load_dataset(write(path, episode_ends=None, dones=flags(1, 4, 8)), max_episode_steps=4)
+    assert (buffer.terminated.tolist(), buffer.truncated.tolist()) == ([True, True, False], [False, False, True])
+    buffer = load_dataset(write(path, rewards=np.ones(N)), max_episode_steps=4)
+    assert (buffer.terminated.tolist(), buffer.truncated.tolist()) == ([False] * 3, [False, False, True])
+
+
+def test_terminals_alone_do_not_tell_of_timeouts(path):
+    write(path, episode_ends=None, terminals=flags(1))
+    with pytest.warns(UserWarning, match=r"terminals tell of terminal states, and nothing tells of time-outs: .* joined"):
+        assert load_dataset(path).episode_lengths.tolist() == [2, 7]
+    with pytest.warns(UserWarning, match=r"1 episodes of more than max_episode_steps=3 are cut after as many steps"):
+        buffer = load_dataset(path, max_episode_steps=3)
+    assert buffer.episode_lengths.tolist() == [2, 3, 3, 1]
+    assert buffer.episode_returns.tolist() == [1, 9, 18, 8]
+    assert buffer.terminated.tolist() == [True, False, False, False]
+    assert buffer.truncated.tolist() == [False, True, True, False]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_dataset(write(path, episode_ends=None, terminals=flags(1), timeouts=flags(4)))
+        load_dataset(write(path, terminals=flags(1)))
+
+
 def test_without_rewards_every_episode_is_a_success(path):
-    buffer = load_flat(write(path, rewards=None))
+    with pytest.warns(UserWarning, match=r"none of rewards, .*, nor any success, so that every episode counts as one, rewa"):
+        buffer = load_flat(write(path, rewards=None))
     assert buffer.rewards.tolist() == [0, 1, 0, 0, 1, 0, 0, 0, 1]
     assert buffer.terminated.all()
 
@@ -79,8 +126,13 @@ def test_bounds_of_actions(path):
     assert load_flat(path, clip_actions=True).actions.max() == 1.0
     cached = load_dataset(path, cache_dir=path.parent / "cache", action_bounds=(np.zeros(2), np.array([512, 600])))
     assert cached.action_space == buffer.action_space
-    with pytest.raises(DatasetError, match=r"episodes.npz, episode 0, step 0: action 30.* outside .*\[-1, 1\]"):
+    with pytest.raises(
+        DatasetError, match=r"episodes.npz, episode 0, step 0: action 30.* outside .*\[-1, 1\].*action_bounds=\("
+    ):
         load_flat(path)
+    for known in (dict(action_bounds=(0, 1)), dict(action_space=spaces.Box(0, 1, (2,)))):
+        with pytest.raises(DatasetError, match=r"outside of the action space \[0, 1\]\.$"):
+            load_flat(path, **known)
     with pytest.raises(DatasetError, match=r"action_bounds is \(0, 1, 2\); smallest and largest action .* or 2 each"):
         load_flat(path, action_bounds=(0, 1, 2))
 
@@ -90,7 +142,10 @@ REFUSED = {
         dict(actions=None),
         "has no array one of actions, action, acts, only episode_ends, observations, rewards",
     ),
-    "no ends": (dict(episode_ends=None), "does not say where episodes end; one of episode_ends, episode_lengths, term"),
+    "no ends": (
+        dict(episode_ends=None),
+        "does not say where episodes end; one of episode_ends, episode_lengths, episode, term",
+    ),
     "ends before the end": (dict(episode_ends=[2, 5]), "episode_ends tells of 5 steps in all; actions have 9"),
     "an empty episode": (dict(episode_ends=[2, 2, 9]), "episode_ends tells of 0 steps in episode 1"),
     "no episode": (dict(episode_ends=np.zeros(0, int)), "episode_ends tells of 0 steps in all"),
@@ -100,7 +155,10 @@ REFUSED = {
     "flat actions": (dict(actions=np.zeros(N)), r"actions have shape \(9,\); \(N, A\) is expected"),
     "words": (dict(rewards=np.array(["good"] * N)), "rewards hold <U4; real numbers are expected"),
     "two rewards": (dict(rewards=np.zeros((N, 2))), "rewards have 2 columns"),
-    "pickles": (dict(rewards=np.array([print] * N)), "rewards hold object; real numbers"),
+    "pickles": (
+        dict(rewards=np.array([print] * N)),
+        "rewards is a pickle of Python objects, which can run code .* allow_pickle=True",
+    ),
 }
 
 

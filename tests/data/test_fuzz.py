@@ -26,6 +26,8 @@ FILES = {
     "metadata": corpus.DATA_FOLDER / "metadata.json",
     "arrow": corpus.DATA_FOLDER / "1" / "part-0.arrow",
     "parquet": corpus.DATA_FOLDER / "1" / "part-0.parquet",
+    "csv": "set.csv",
+    "table": "set.parquet",
 }
 MOST_SECONDS, MOST_BYTES = 5, 2**29
 BOUNDED = settings(derandomize=True, deadline=None, max_examples=40, database=None, suppress_health_check=list(HealthCheck))
@@ -65,7 +67,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def read_or_refuse(folder: Path, kind: str) -> None:
     """What is read is whole: as many steps as the episodes have, all of them finite."""
     options = {"observation_keys": ["state"]} if kind == "robomimic" else {}
-    paths = {"npz": FILES["npz"], "flat": FILES["flat"], "robomimic": FILES["robomimic"]}
+    paths = {kind: FILES[kind] for kind in ("npz", "flat", "robomimic", "csv", "table")}
     paths |= dict.fromkeys(("lerobot", "lerobot, told"), "arm")
     dataset = folder / paths[kind] if kind in paths else corpus.MINARI_ID
     signal.alarm(MOST_SECONDS)

@@ -12,7 +12,9 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_dtfm import DT
 from sb3_dtfm.data import DatasetError, Trajectory, load_dataset
+from sb3_dtfm.envs import ReturnToGoWrapper
 
 LENGTHS, N_ACTIONS = (3, 5), 2
 
@@ -148,8 +150,122 @@ def test_an_unfit_episode_can_be_dropped_and_actions_clipped():
 def test_rewards_that_are_made_up_although_something_was_there_are_told_of():
     episode = {"obs": np.zeros((3, 2)), "acts": ACTS, "rew": np.zeros(3), "done": np.zeros(3)}
     for given in ([episode], {**episode, "episode_lengths": [3]}):
-        with pytest.warns(UserWarning, match=r"none of rewards, reward, rews, so that success is .* Not read: done, rew\."):
+        with pytest.warns(UserWarning, match=r"none of rewards, reward, rews, nor any success, so .* Not read: rew\."):
             assert load_dataset(given).episode_returns.tolist() == [1.0]
+
+
+def done_steps(lengths=(4, 5, 2)):
+    """Steps of several episodes, the last of which has not ended."""
+    rng = np.random.default_rng(0)
+    ends = np.cumsum(lengths[:-1]) - 1
+    return [
+        {"obs": rng.normal(size=3), "action": rng.uniform(-1, 1, 2), "reward": float(t), "done": t in ends}
+        for t in range(sum(lengths))
+    ]
+
+
+STEPS = {
+    "dictionaries": lambda step: step,
+    "Gymnasium": lambda step: (step["obs"], step["action"], step["reward"], step["done"], False),
+    "Gymnasium with info": lambda step: (
+        step["obs"],
+        step["action"],
+        step["reward"],
+        step["done"],
+        False,
+        {"is_success": 1},
+    ),
+    "with done": lambda step: (step["obs"], step["action"], step["reward"], step["done"]),
+    "with done and info": lambda step: (step["obs"], step["action"], step["reward"], step["done"], {}),
+    "SB3": lambda step: (step["obs"], step["action"], step["obs"], step["reward"], step["done"]),
+    "SB3 with arrays of one": lambda step: (
+        *(step["obs"], step["action"], step["obs"]),
+        *(np.array([step["reward"]]), np.array([step["done"]]), [{}]),
+    ),
+}
+
+
+@pytest.mark.parametrize("nested", [False, True])
+@pytest.mark.parametrize("kind", STEPS)
+def test_steps_of_every_kind_are_read_alike(kind, nested):
+    """All of them in one list, or an episode a list; four or five steps of one are not four or five parts of a step."""
+    given, lengths = done_steps(), [4, 5, 2]
+    steps = [STEPS[kind](step) for step in given]
+    stops = np.cumsum(lengths)
+    dataset = [steps[stop - n : stop] for stop, n in zip(stops, lengths, strict=True)] if nested else steps
+    buffer = load_dataset(dataset)
+    assert buffer.episode_lengths.tolist() == lengths
+    np.testing.assert_array_equal(buffer.observations, np.float32([step["obs"] for step in given]))
+    np.testing.assert_array_equal(buffer.actions, np.float32([step["action"] for step in given]))
+    assert buffer.rewards.tolist() == [step["reward"] for step in given]
+    assert buffer.terminated.tolist() == [True, True, False]
+    assert np.isnan(buffer.successes).all() == (kind != "Gymnasium with info")
+
+
+def test_steps_without_an_array_or_an_end_are_named():
+    steps = done_steps()
+    del steps[4]["reward"]
+    with pytest.raises(DatasetError, match="steps: step 4 has no 'reward', which step 0 has"):
+        load_dataset(steps)
+    endless = [{name: part for name, part in step.items() if name != "done"} for step in done_steps()]
+    with pytest.raises(DatasetError, match=r"does not say where episodes end; one of .*dones"):
+        load_dataset(endless)
+    numbered = [{**step, "episode_id": number // 4} for number, step in enumerate(endless)]
+    assert load_dataset(numbered).episode_lengths.tolist() == [4, 4, 3]
+
+
+NUMBERS = {
+    "SB3": [(t, 1, t + 1, float(t), t == 3) for t in range(4)],
+    "SB3, whole rewards": [(t, 1, t + 1, t, t == 3) for t in range(4)],
+    "Gymnasium": [(t, 1, float(t), t == 3, False) for t in range(4)],
+    "Gymnasium, whole flags": [(t, 1, float(t), int(t == 3), 0) for t in range(4)],
+}
+
+
+@pytest.mark.parametrize("kind", NUMBERS)
+def test_a_next_observation_that_is_a_number_is_no_reward(kind):
+    buffer = load_dataset(NUMBERS[kind], action_space=spaces.Discrete(2))
+    assert (buffer.rewards.tolist(), buffer.terminated.tolist()) == ([0, 1, 2, 3], [True])
+
+
+def test_infos_tell_of_the_time_limit():
+    late = {"TimeLimit.truncated": True}
+    steps = [(OBS[0], ACTS[0], 1.0, t % 2 == 1, late if t == 3 else {}) for t in range(6)]
+    buffer = load_dataset(steps)
+    assert (buffer.terminated.tolist(), buffer.truncated.tolist()) == ([True, False, True], [False, True, False])
+
+
+CHOICES = spaces.Dict({"where": spaces.Discrete(3, start=1), "arm": spaces.Box(-9, 9, (2,))})
+
+
+def test_choices_in_observations_are_those_of_the_environment():
+    observations = {"where": np.array([1, 3, 2, 1]), "arm": np.arange(8.0).reshape(4, 2)}
+    arrays = {"actions": np.zeros((4, 2)), "rewards": np.zeros(4), "dones": [0, 1, 0, 1]}
+    halves = [
+        {"obs": {name: part[half] for name, part in observations.items()}, "acts": np.zeros((2, 2)), "rews": np.zeros(2)}
+        for half in (slice(2), slice(2, 4))
+    ]
+    steps = [({name: part[t] for name, part in observations.items()}, np.zeros(2), 0.0, t % 2 == 1, False) for t in range(4)]
+    expected = np.hstack([observations["arm"], np.eye(3)[observations["where"] - 1]])
+    for given in ({**arrays, "observations": observations}, halves, steps, [steps[:2], steps[2:]]):
+        np.testing.assert_array_equal(load_dataset(given, observation_space=CHOICES).observations, expected)
+        chosen = load_dataset(given, observation_space=CHOICES, observation_keys=["where"])
+        np.testing.assert_array_equal(chosen.observations, expected[:, 2:])
+        assert load_dataset(given).observation_space.shape == (3,)
+        with pytest.raises(DatasetError, match=r"no 'leg', only (where, arm|arm, where)"):
+            load_dataset(given, observation_keys=["leg"])
+    for given in ([(4, 1, 0.0, True)], [(0, 1, 0.0, True)]):
+        with pytest.raises(DatasetError, match=r"hold . *, which is not in Discrete\(3, start=1\)"):
+            load_dataset(given, observation_space=CHOICES["where"], action_space=spaces.Discrete(2))
+    with pytest.raises(DatasetError, match="has no where, which the environment observes, only arm"):
+        load_dataset({**arrays, "observations": {"arm": observations["arm"]}}, observation_space=CHOICES)
+
+
+def test_a_model_tells_its_data_of_the_environments_choices():
+    course = Course(goal=True)
+    steps = [({"b": np.arange(3.0), "a": t % 2}, np.array([0.5, 1.0]), 1.0, t % 4 == 3, False) for t in range(8)]
+    model = DT("MultiInputPolicy", ReturnToGoWrapper(course), dataset=steps, device="cpu")
+    assert model.buffer.observations[:2].tolist() == [[1, 0, 0, 1, 2], [0, 1, 0, 1, 2]]
 
 
 class Course(gym.Env):

@@ -41,7 +41,7 @@ def write(folder, version="v2.1", info=None, **changes):
     for episode in np.unique(episodes) if version == "v2.1" else [None]:
         chosen = np.flatnonzero(episodes == episode) if episode is not None else np.arange(len(episodes))
         table = pa.table({name: list(values[chosen]) for name, values in found.items()})
-        name = f"file-{0:03d}" if episode is None else f"episode_{episode:06d}"
+        name = f"file-{0:03d}" if episode is None else f"episode_{int(10 * episode):06d}"
         pq.write_table(table, data / f"{name}.parquet")
     return str(folder)
 
@@ -89,6 +89,21 @@ UNFIT = {
     "frames": (dict(frame_index=np.arange(12)), "episode 1: frame_index does not count its 5 frames from 0 on"),
     "other frames than told": (dict(info={"total_frames": 13}), "info.json tells of 13 frames; there are 12"),
     "other episodes than told": (dict(info={"total_episodes": 4}), "info.json tells of 4 episodes; there are 3"),
+    "a version to come": (
+        dict(info={"codebase_version": "v9.0"}),
+        "info.json: codebase_version is 'v9.0'; formats v2.0 to v3",
+    ),
+    "no version": (dict(info={"codebase_version": None}), "info.json: codebase_version is None"),
+    "a fraction of a frame": (
+        dict(info={"total_frames": 40.7}),
+        "info.json: total_frames is 40.7; a whole number of at least",
+    ),
+    "two rewards": ({"next.reward": np.zeros((12, 2))}, "next.reward has 2 numbers a frame; one is expected"),
+    "half an episode": (
+        dict(episode_index=np.r_[np.zeros(3), np.full(5, 0.5), np.full(4, 2.0)]),
+        "episode_index is 0.5; whole",
+    ),
+    "half a success": ({"next.success": np.full(12, 0.5)}, "next.success hold 0.5 at step 0; 0 and 1 are accepted"),
     "NaN": (dict(action=np.full((12, 2), np.nan)), "episode 0, step 0: actions hold nan"),
     "no features": (dict(info={"features": 3}), "info.json: cannot be read"),
 }
@@ -126,3 +141,31 @@ def test_damaged_files(tmp_path):
     file.unlink()
     with pytest.raises(DatasetError, match=r"arm: there is no parquet file below data"):
         load_dataset(path)
+
+
+def test_a_link_out_of_the_folder_is_refused(tmp_path):
+    path = write(tmp_path / "arm")
+    (tmp_path / "arm" / "data" / "x").symlink_to("/")
+    with pytest.raises(DatasetError, match=r"data/x leads to /; links within .*arm are accepted"):
+        load_dataset(path)
+    info = tmp_path / "arm" / "meta" / "info.json"
+    info.rename(tmp_path / "other.json")
+    info.symlink_to(tmp_path / "other.json")
+    with pytest.raises(DatasetError, match=r"info.json leads to .*other.json; links within .*arm are accepted"):
+        load_dataset(path)
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_some_of_the_episodes(version, tmp_path):
+    path = write(tmp_path / "arm", version)
+    whole = load_dataset(path)
+    chosen = load_dataset(path, episodes=[2, 0])
+    assert chosen.episode_lengths.tolist() == [4, 3]
+    np.testing.assert_array_equal(chosen.observations, np.r_[whole.observations[8:], whole.observations[:3]])
+    with pytest.raises(DatasetError, match="arm: there is no episode 3, only 0 to 2"):
+        load_dataset(path, episodes=[3])
+
+
+def test_without_rewards_it_is_said_what_counts(tmp_path):
+    with pytest.warns(UserWarning, match=r"arm: there is none of rewards, .* every episode counts as one"):
+        load_dataset(write(tmp_path / "arm"))

@@ -169,8 +169,29 @@ def test_anything_else_is_refused_with_what_is_accepted(dataset: Any):
 def test_an_unknown_option_is_refused_with_those_there_are(robomimic_file: Path, minari_dataset: minari.MinariDataset):
     with pytest.raises(
         TypeError,
-        match=r"unknown option filter \(did you mean filter_key\?\); accepted: filter_key, observation_keys, on_invalid",
+        match=r"unknown option filter \(did you mean filter_key\?\); accepted: filter_key, observation_keys, clip_act",
     ):
         load_dataset(robomimic_file, filter="train")
-    with pytest.raises(TypeError, match="test/ones-v0: unknown option filter_key; accepted: on_invalid, cache_dir, env_id"):
+    with pytest.raises(TypeError, match="test/ones-v0: unknown option filter_key; accepted: observation_keys, clip_act"):
         load_dataset("test/ones-v0", filter_key="train")
+
+
+WRONG = {
+    "clip_actions": ("no", "one of True, False"),
+    "success_only": (1, "one of True, False"),
+    "allow_pickle": ("yes", "one of True, False"),
+    "env_id": (5, "the id of an environment, or None"),
+    "cache_dir": ("", "the path of a folder, or None"),
+    "min_return": ("high", "a finite number, or None"),
+    "max_episode_steps": (0, "a whole number of at least 1, or None"),
+    "observation_keys": ("state", "a list of names, or None"),
+    "action_keys": ([1], "a list of names, or None"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_options_are_looked_at(name):
+    value, accepted = WRONG[name]
+    arrays = {"obs": np.zeros((2, 3)), "action": np.zeros((2, 2)), "reward": np.zeros(2), "done": [False, True]}
+    with pytest.raises(ValueError, match=rf"{name} must be {accepted}, got {value!r}".replace("[1]", r"\[1\]")):
+        load_dataset(arrays, **{name: value})

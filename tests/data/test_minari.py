@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import time
 import warnings
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ def datasets_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         raise ConnectionError("no network in tests")
 
     monkeypatch.setattr(minari, "download_dataset", no_network)
+    monkeypatch.setenv("MINARI_REMOTE", "none://of-tests")
     return tmp_path / "datasets"
 
 
@@ -199,7 +201,9 @@ def test_zeroed_bytes_in_the_file_are_found():
 def test_missing_or_broken_metadata_is_named(content: str | None, datasets_path: Path):
     metadata = data_file(write([make_episode(3)]), "metadata.json")
     metadata.unlink() if content is None else metadata.write_text(content)
-    with pytest.raises(DatasetError, match=r"test/set-v0.*(damaged or incomplete|dataset_id is None)") as caught:
+    with pytest.raises(
+        DatasetError, match=r"test/set-v0.*(does not exist|damaged or incomplete|dataset_id is None)"
+    ) as caught:
         load_minari("test/set-v0")
     assert str(datasets_path) in str(caught.value)
 
@@ -282,3 +286,67 @@ def test_images_are_refused():
     dataset = write([make_episode(3, observations=images)], observation_space=spaces.Box(0, 255, (40, 40, 3), np.uint8))
     with pytest.raises(DatasetError, match=r"test/set-v0.*holds an image"):
         load_minari(dataset)
+
+
+def change_metadata(dataset: minari.MinariDataset, **changes: Any) -> None:
+    path = data_file(dataset, "metadata.json")
+    metadata = {**json.loads(path.read_text()), **changes}
+    path.write_text(json.dumps({name: value for name, value in metadata.items() if value is not None}))
+
+
+def test_an_old_dataset_that_does_not_name_its_format_is_read():
+    dataset = write([make_episode(4)])
+    change_metadata(dataset, data_format=None, minari_version="0.5.0")
+    assert load_minari("test/set-v0").episode_lengths.tolist() == [4]
+
+
+def test_a_dataset_of_a_newer_minari_is_no_damaged_one():
+    change_metadata(write([make_episode(4)]), minari_version="99.0.0")
+    with pytest.raises(DatasetError, match=r"written by Minari '99.0.0', which .* not read: .*upgrade minari\.$"):
+        load_minari("test/set-v0")
+
+
+@pytest.mark.parametrize("seen", ["vectors", "one image a step"])
+def test_vectors_that_minari_stores_as_jpeg_are_named(seen: str):
+    """Bytes of shape (T + 1, 6) count as an image; frames that happen to be of one length become a table."""
+    observations = np.zeros((5, 6), np.uint8)
+    dataset = write([make_episode(4, observations=observations)], observation_space=spaces.Box(0, 255, (6,), np.uint8))
+    if seen != "vectors":
+        with h5py.File(data_file(dataset), "a") as file:
+            frames = np.stack(file["episode_0/observations"][:])
+            del file["episode_0/observations"]
+            file["episode_0/observations"] = frames
+    with pytest.raises(DatasetError, match="episode 0: observations hold JPEG images, as which Minari stores arrays of byt"):
+        load_minari(dataset)
+
+
+def test_a_hub_that_cannot_be_reached_fails_at_once(monkeypatch: pytest.MonkeyPatch):
+    """Minari's client would look for it five times, for half a minute."""
+    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
+    monkeypatch.setenv("MINARI_REMOTE", "hf://farama-minari")
+    begin = time.monotonic()
+    with pytest.raises(DatasetError, match=r"test/none-v0 is not in .*; and it cannot be downloaded: .*refused"):
+        load_minari("test/none-v0")
+    assert time.monotonic() - begin < 5.0
+
+
+def test_entries_of_dictionary_observations_are_chosen():
+    space = spaces.Dict({"b": spaces.Box(-9, 9, (2,)), "a": spaces.Discrete(3), "c": spaces.Box(-9, 9, (1,))})
+    seen = {"a": np.array([0, 2, 1, 0]), "b": np.zeros((4, 2), np.float32), "c": np.full((4, 1), 5.0, np.float32)}
+    for data_format in ("hdf5", "parquet"):
+        dataset_id = f"test/{data_format}-v0"
+        episode = make_episode(3, observations=seen)
+        write([episode], dataset_id, observation_space=space, data_format=data_format)
+        np.testing.assert_array_equal(
+            load_minari(dataset_id, observation_keys=["c", "a"]).observations, [[5, 1, 0, 0], [5, 0, 0, 1], [5, 0, 1, 0]]
+        )
+        with pytest.raises(DatasetError, match=r"observation_keys is \['d'\]; the observations have entries a, b, c"):
+            load_minari(dataset_id, observation_keys=["d"])
+    write([make_episode(3)])
+    with pytest.raises(DatasetError, match=r"observation_keys is \['d'\]; the observations have no entries, but Box"):
+        load_minari("test/set-v0", observation_keys=["d"])
+
+
+def test_actions_outside_of_the_space_can_be_clipped():
+    write([make_episode(5, actions=np.full((5, 2), 0.9, np.float32))])
+    assert load_minari("test/set-v0", clip_actions=True).actions.unique().tolist() == [np.float32(0.4)]

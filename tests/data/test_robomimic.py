@@ -2,11 +2,13 @@
 
 import json
 import os
+import re
 
 import h5py
 import numpy as np
 import pytest
 
+from sb3_dtfm.data import load_dataset
 from sb3_dtfm.data.robomimic import load_robomimic
 from sb3_dtfm.data.trajectories import DatasetError
 
@@ -321,6 +323,35 @@ def test_absolute_actions_are_refused(path, controller):
 )
 def test_the_environment_is_the_registered_one_of_the_file_s_task(path, name, env_id):
     assert load_robomimic(write(path, {"demo_0": make_demo(3)}, env_args(name))).env_id == env_id
+
+
+OTHERWISE = {
+    "kp": ({"kp": 300}, {}, "kp is 300 instead of 150"),
+    "output_max": ({"output_max": [0.025] * 3 + [0.25] * 3}, {}, r"output_max is \[0.025, .* instead of \[0.05, "),
+    "type": ({"type": "JOINT_VELOCITY"}, {}, "type is 'JOINT_VELOCITY' instead of 'OSC_POSE'"),
+    "damping": ({"damping": 2}, {}, "damping_ratio is 2 instead of 1"),
+    "control_freq": ({}, {"control_freq": 10}, "control_freq is 10 instead of 20"),
+    "robots": ({}, {"robots": ["Sawyer"]}, r"robots is \['Sawyer'\] instead of 'Panda'"),
+}
+
+
+@pytest.mark.parametrize("version", ["1.4.1", "1.5.1"])
+@pytest.mark.parametrize(("arm", "kwargs", "message"), OTHERWISE.values(), ids=OTHERWISE)
+def test_actions_that_move_the_arm_otherwise_are_refused(path, arm, kwargs, message, version):
+    arm = {**OLD_CONTROLLER, **arm}
+    controller = arm if version < "1.5" else {"type": "BASIC", "body_parts": {"right": arm}}
+    write(path, {"demo_0": make_demo(3)}, env_args("Lift", version, controller_configs=controller, **kwargs))
+    found = refused(path)
+    assert re.search(f"an action does something else than in robosuite/Lift-v0: {message}", found), found
+    assert load_dataset(path, env_id="My/Lift-v0").env_id == "My/Lift-v0"
+
+
+def test_actions_outside_of_the_controllers_range_can_be_clipped(path):
+    demo = make_demo(3)
+    demo["actions"][0, 0] = 1.5
+    write(path, {"demo_0": demo})
+    assert "action 1.5 in dimension 0" in refused(path)
+    assert load_robomimic(path, clip_actions=True).actions.max() == 1.0
 
 
 def test_a_file_that_names_no_environment_is_read(path):

@@ -9,6 +9,7 @@ import pytest
 from sb3_dtfm.envs.robosuite import (
     TASKS,
     RobosuiteEnv,
+    differences_from_robomimic,
     env_id_from_robomimic,
     env_kwargs_from_robomimic,
     register_robosuite_envs,
@@ -77,6 +78,7 @@ def test_controller_of_an_old_robomimic_file_moves_like_the_default(lift):
         "type": 1,
         "env_kwargs": {"robots": ["Panda"], "control_freq": 20, "controller_configs": OLD_CONTROLLER},
     }
+    assert differences_from_robomimic(env_args) == {}
     env = RobosuiteEnv(**env_kwargs_from_robomimic(env_args))
     np.testing.assert_array_equal(rollout(env, seed=2), rollout(lift, seed=2))
     env.close()
@@ -87,6 +89,7 @@ def test_env_args_describe_the_environment(task, environment):
     env = environment(task)
     env_args = json.loads(json.dumps(env.env_args))
     assert env_args["env_name"] == TASKS[task].environment
+    assert differences_from_robomimic(env_args) == {}
     arguments = env_kwargs_from_robomimic(env_args)
     assert arguments["task"] == task
     assert arguments["controller_config"]["body_parts"]["right"]["type"] == "OSC_POSE"

@@ -1,0 +1,107 @@
+"""Tables, with a row for each step: DataFrames, CSV and Parquet."""
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from gymnasium import spaces
+
+from sb3_dtfm.data import DatasetError, load_dataset
+
+COLUMNS = {
+    "episode": ["b", "b", "a", "a", "a"],
+    "obs_0": [0.0, 1.0, 2.0, 3.0, 4.5],
+    "obs_1": [1, 1, 1, 2, 2],
+    "action": [0.5, -1.0, 1.0, 0.0, 0.25],
+    "reward": [0, 1, 0, 0, 2],
+}
+NAMED = dict(observation_keys=["position", "speed"], action_keys=["force"])
+NAMES = {"obs_0": "position", "obs_1": "speed", "action": "force"}
+
+
+def as_csv(path, columns):
+    rows = [",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]
+    (path / "log.csv").write_text("\n".join(rows) + "\n")
+    return path / "log.csv"
+
+
+def as_parquet(path, columns):
+    pq.write_table(pa.table(columns), path / "log.parquet")
+    return path / "log.parquet"
+
+
+def as_frame(path, columns):
+    return pytest.importorskip("pandas").DataFrame(columns)
+
+
+KINDS = {"csv": as_csv, "parquet": as_parquet, "DataFrame": as_frame}
+
+
+@pytest.fixture(params=KINDS.values(), ids=KINDS)
+def write(request, tmp_path):
+    return lambda columns: request.param(tmp_path, columns)
+
+
+def check(buffer):
+    np.testing.assert_array_equal(buffer.observations, np.stack([COLUMNS["obs_0"], COLUMNS["obs_1"]], axis=1))
+    np.testing.assert_array_equal(buffer.actions[:, 0], COLUMNS["action"])
+    assert buffer.episode_lengths.tolist() == [2, 3]
+    assert buffer.episode_returns.tolist() == [1, 2]
+
+
+def test_columns_by_how_they_begin_or_by_name(write):
+    check(load_dataset(write(COLUMNS)))
+    named = write({NAMES.get(name, name): column for name, column in COLUMNS.items()})
+    check(load_dataset(named, **NAMED))
+    with pytest.raises(
+        DatasetError, match=r"has no array one of actions.*Name the columns with observation_keys=\[...\] and"
+    ):
+        load_dataset(named)
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_a_file_is_cached(kind, tmp_path):
+    path = KINDS[kind](tmp_path, COLUMNS)
+    for _ in range(2):
+        check(load_dataset(path, cache_dir=tmp_path / "cache"))
+
+
+def test_whole_numbers_are_choices_where_the_environment_has_some(write):
+    table = write({**COLUMNS, "action": [0, 1, 1, 0, 1]})
+    assert load_dataset(table, action_space=spaces.Discrete(2)).actions[:, 1].tolist() == [0, 1, 1, 0, 1]
+    assert load_dataset(table, action_space=spaces.Box(-1, 1, (1,))).actions[:, 0].tolist() == [0, 1, 1, 0, 1]
+
+
+def test_columns_of_vectors(tmp_path):
+    vectors = {"obs": [[0.0, 1.0]] * 4, "action": [[0.5]] * 4, "reward": [1.0] * 4, "done": [False, True, False, True]}
+    for write in (as_parquet, as_frame):
+        buffer = load_dataset(write(tmp_path, vectors))
+        assert (buffer.observation_space.shape, buffer.terminated.tolist()) == ((2,), [True, True])
+
+
+def test_steps_of_an_episode_lie_side_by_side(write):
+    with pytest.raises(DatasetError, match=r"episode a comes in several places; .* as after a stable sort"):
+        load_dataset(write({**COLUMNS, "episode": list("ababa")}))
+
+
+UNFIT = {
+    "a short row": ("obs_0,action,done\n1,0.5,0\n1,0.5\n", r"log.csv, row 3: has 2 entries, and the first row names 3"),
+    "a name twice": ("obs_0,obs_0,action\n1,2,3\n", "a name for each column is expected, each once"),
+    "words": ("obs_0,action,done\nfar,0.5,1\n", "obs_0 hold object; real numbers are expected"),
+    "a hole": ("obs_0,action,done,reward\n1,0.5,0,1\n,0.5,1,1\n", "episode 0, step 1: observations hold nan"),
+    "nothing": ("", "has no array one of actions, action, acts, only nothing"),
+}
+
+
+@pytest.mark.parametrize(("text", "message"), UNFIT.values(), ids=UNFIT)
+def test_what_is_no_table_is_refused(text, message, tmp_path):
+    (tmp_path / "log.csv").write_text(text)
+    with pytest.raises(DatasetError, match=message):
+        load_dataset(tmp_path / "log.csv")
+
+
+def test_a_parquet_file_that_claims_more_than_it_stores(tmp_path):
+    zeros = pa.array(np.zeros(40_000_000, np.float32))
+    pq.write_table(pa.table({"obs_0": zeros, "action": zeros, "reward": zeros}), tmp_path / "log.parquet")
+    with pytest.raises(DatasetError, match=r"40000000 rows claim \d+ bytes, of which \d+ are stored"):
+        load_dataset(tmp_path / "log.parquet")
