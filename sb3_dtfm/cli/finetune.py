@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_dtfm.zoo import commands
-from sb3_dtfm.zoo.arguments import UsageError, resumed_run
+from sb3_dtfm.zoo.arguments import UsageError, restored_arguments, resumed_run
 from sb3_dtfm.zoo.registration import finetuning_config, register
 from sb3_dtfm.zoo.resuming import Start
 
@@ -32,12 +32,15 @@ def main(argv: Sequence[str]) -> None:
         parser.print_help()
         commands.train(["--help"])
     resumed, others = resumed_run(argv)
-    if resumed is not None and not others:
+    restored = None
+    if resumed is not None:
         argv = Start.read(resumed, "finetune").arguments
-    elif resumed is not None:
-        raise UsageError(
-            f"--resume {resumed}: takes no other arguments, as a run goes on with its own; got {' '.join(others)}."
-        )
+        restored = restored_arguments(resumed, others)
+        if restored is None:
+            raise UsageError(
+                f"--resume {resumed}: takes no other arguments but --gym-packages and --conf-file, as a run goes on with its "
+                f"own; got {' '.join(others)}."
+            )
     options, rest = parser.parse_known_args(argv)
     if "-optimize" in rest or "--optimize-hyperparameters" in rest:
         raise UsageError("-optimize: hyperparameters of finetune cannot be searched; -params changes them.")
@@ -46,7 +49,7 @@ def main(argv: Sequence[str]) -> None:
     if options.eval_freq is not None:
         given += ["--eval-freq", str(options.eval_freq)]
     evaluations_of_a_run = EVALUATIONS_OF_A_RUN if options.eval_freq is None else None
-    commands.finetune([*given, *rest], options.model, options.target_return, argv, resumed, evaluations_of_a_run)
+    commands.finetune([*given, *rest], options.model, options.target_return, argv, resumed, evaluations_of_a_run, restored)
 
 
 def _parser() -> argparse.ArgumentParser:

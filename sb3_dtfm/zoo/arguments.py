@@ -2,9 +2,11 @@
 
 import argparse
 import importlib
-from collections.abc import Sequence
+import os
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import yaml
@@ -12,8 +14,9 @@ from rl_zoo3.utils import StoreDict
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.envs import register_gymnasium_robotics
+from sb3_dtfm.files import CLASSES, EVALUATED, check_settings, literal
 from sb3_dtfm.finetuning import FINETUNED
-from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, packaged_config
+from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, is_packaged, packaged_config
 
 # In a run's settings.
 WRAPPER = "sb3_dtfm.envs.ReturnToGoWrapper"
@@ -21,6 +24,10 @@ TRAIN_EXAMPLES = """\
   sb3-dtfm train --algo dtfm --env HalfCheetah-v5
   sb3-dtfm train --algo dt --env robosuite/Lift-v0 --dataset lift.hdf5 --dataset-fraction 0.5
 """
+
+
+# In a run's folder: how it was started.
+START = "start.json"
 
 
 class UsageError(ValueError):
@@ -68,34 +75,99 @@ def _shows_return_to_go(wrapper: str | type) -> bool:
     return name.rpartition(".")[2] == WRAPPER.rpartition(".")[2]
 
 
-def key_values(option: str, texts: Sequence[str]) -> dict[str, Any]:
+def zoo_value(text: str) -> Any:
+    """A value of the command line, which RL-Zoo evaluates as Python."""
+    parsed = argparse.Namespace()
+    StoreDict([], "values")(argparse.ArgumentParser(), parsed, [f"value:{text}"])
+    return parsed.values["value"]
+
+
+def key_values(option: str, texts: Sequence[str], evaluate: Callable[[str], Any] = zoo_value) -> dict[str, Any]:
     """
-    Keys with their values, which RL-Zoo evaluates as Python.
+    Keys with their values.
 
     :param option: for the message
     :param texts: `key:value` each
+    :param evaluate: makes a value of its text, by default as RL-Zoo does: Python
     :raises UsageError: one cannot be evaluated
     """
     values = {}
     for text in texts:
-        parsed = argparse.Namespace()
+        key, _, value = text.partition(":")
         try:
-            StoreDict([], "values")(argparse.ArgumentParser(), parsed, [text])
+            values[key] = evaluate(value)
         except Exception as error:  # whatever the user's expression raises
-            raise UsageError(f"{option} {text}: expected key:value with a value in Python ({error}).") from error
-        values.update(parsed.values)
+            mend = f"; text needs quotes of its own: \"{key}:'{value}'\"" if isinstance(error, NameError | SyntaxError) else ""
+            raise UsageError(f"{option} {text}: expected key:value with a value in Python ({error}){mend}.") from error
     return values
+
+
+class StoreValues(argparse.Action):
+    """RL-Zoo's `StoreDict`, with a user's mistake in one line."""
+
+    def __call__(self, _: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
+        setattr(namespace, self.dest, key_values(str(option), values))
+
+
+class StoreLiterals(argparse.Action):
+    """The same of arguments that others may have written: nothing is evaluated, and classes are known ones."""
+
+    def __call__(self, _: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
+        given, where = key_values(f"{START}: {option}", values, literal), f"{START}: {option}"
+        if self.dest == "hyperparams":
+            setattr(namespace, self.dest, check_settings(given, where, [*CLASSES, *EVALUATED]))
+        else:
+            setattr(namespace, self.dest, check_settings({self.dest: given}, where, [])[self.dest])
+
+
+class Restored(NamedTuple):
+    """
+    What the user names beside `--resume RUN`, where all other arguments come from the run's folder.
+
+    :param run: its folder
+    :param packages: of `--gym-packages`
+    :param conf_file: of `--conf-file`, None for none
+    """
+
+    run: Path
+    packages: list[str]
+    conf_file: str | None
+
+    def check_package(self, name: str) -> None:
+        """
+        :param name: of a module that the run's folder names
+        :raises UsageError: the user does not name it
+        """
+        if name not in self.packages:
+            raise UsageError(
+                f"--resume {self.run}: {START} names the package {name}, which is imported only if you name it, too: "
+                f"--resume {self.run} --gym-packages {name}."
+            )
+
+    def check_config(self, path: str) -> None:
+        """
+        :param path: of settings that the run's folder names
+        :raises UsageError: they did not come with this package, and the user does not name them
+        """
+        if path != self.conf_file and not is_packaged(path):
+            raise UsageError(
+                f"--resume {self.run}: {START} names the settings {path}, which can run code; if you trust them: "
+                f"--resume {self.run} --conf-file {path}."
+            )
 
 
 def import_packages(modules: Sequence[str], where: str = "--gym-packages") -> None:
     """
-    Import what registers tasks, as RL-Zoo's `--gym-packages` does; gymnasium-robotics needs no mention.
+    Import what registers tasks, as RL-Zoo's `--gym-packages` does, also from the current folder; gymnasium-robotics needs no
+    mention.
 
     :param modules: dotted names
     :param where: they were named, for the message
     :raises UsageError: there is none of that name
     """
     register_gymnasium_robotics()
+    if modules and os.getcwd() not in sys.path and "" not in sys.path:
+        sys.path.append(os.getcwd())  # where `python -m` looks, but no installed command does
     for module in modules:
         try:
             importlib.import_module(module)
@@ -144,6 +216,24 @@ def train_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def restored_arguments(run: Path, others: Sequence[str]) -> Restored | None:
+    """
+    What a user names beside `--resume`, whose packages are imported; None where there are other arguments.
+
+    :param run: its folder
+    :param others: the user's arguments beside `--resume`
+    :raises UsageError: no such package
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--gym-packages", nargs="+", default=[])
+    parser.add_argument("-conf", "--conf-file")
+    options, rest = parser.parse_known_args(others)
+    if rest:
+        return None
+    import_packages(options.gym_packages)
+    return Restored(run, options.gym_packages, options.conf_file)
+
+
 def resumed_run(argv: Sequence[str]) -> tuple[Path | None, list[str]]:
     """
     The run that `--resume` names, None without, and the other arguments.
@@ -156,22 +246,21 @@ def resumed_run(argv: Sequence[str]) -> tuple[Path | None, list[str]]:
     return options.resume, others
 
 
-def resumed_arguments(run: Path, started: list[str], others: Sequence[str]) -> list[str]:
+def repeated_arguments(run: Path, started: list[str], others: Sequence[str]) -> list[str]:
     """
     Arguments for RL-Zoo's `train` of a run that goes on.
 
     :param run: its folder
     :param started: what it was started with
-    :param others: the user's arguments beside `--resume`: none, or all of them once more
+    :param others: the user's arguments beside `--resume`: all of them once more
     :raises UsageError: others, of another algorithm or task
     """
-    if not others:
-        return started
     arguments = train_arguments(others)
     of_the_run, given = (train_parser().parse_known_args(each)[0] for each in (started, arguments))
     if (of_the_run.algo, of_the_run.env) != (given.algo, given.env):
         raise UsageError(
-            f"--resume {run}: takes no other arguments; it was started with --algo {of_the_run.algo} --env {of_the_run.env}."
+            f"--resume {run}: takes no other arguments but --gym-packages and --conf-file; it was started with "
+            f"--algo {of_the_run.algo} --env {of_the_run.env}."
         )
     return arguments
 

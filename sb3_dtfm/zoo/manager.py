@@ -18,12 +18,13 @@ from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.arguments import with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.distributed import is_first_process
-from sb3_dtfm.zoo.arguments import UsageError, asked_for, asking_for
+from sb3_dtfm.zoo.arguments import Restored, UsageError, asked_for, asking_for
 from sb3_dtfm.zoo.comparison import MeasureRandomActions, compare
 from sb3_dtfm.zoo.registration import with_policy_options
 from sb3_dtfm.zoo.resuming import CHECKPOINT, KeepCheckpoint, ReplaceEvaluations, Start, StopSignals, go_on
@@ -49,12 +50,24 @@ class OfflineExperimentManager(ExperimentManager):
 
     :param arguments: what the command was called with
     :param resumed: folder of a run to go on with, instead of a new one
+    :param restored: where the arguments come from that folder: what the user named beside it
     """
 
     command = "train"
 
-    def __init__(self, *args: Any, arguments: Sequence[str] = (), resumed: Path | None = None, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        *args: Any,
+        arguments: Sequence[str] = (),
+        resumed: Path | None = None,
+        restored: Restored | None = None,
+        **kwargs: Any,
+    ) -> None:
         super().__init__(*args, **kwargs)
+        if resumed is not None and self.algo not in ALGORITHMS:  # whose checkpoints are pickles
+            raise UsageError(f"--resume {resumed}: runs of {' and '.join(ALGORITHMS)} go on, none of --algo {self.algo}.")
+        if restored is not None:
+            restored.check_config(self.config)
         self.valueless: list[str] = []  # why trials of a search have no value
         self.signals = StopSignals(between_steps=self.algo in ALGORITHMS)
         self.keeper: KeepCheckpoint | None = None
@@ -122,6 +135,13 @@ class OfflineExperimentManager(ExperimentManager):
         unknown = sorted(set(self._hyperparams) - set(known))
         if unknown:
             raise UsageError(f"{with_nearest(unknown, known)}: no hyperparameter of {self.algo}.") from error
+
+    def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
+        """RL-Zoo's; dt and dtfm need none of the pickled statistics that it would load from beside a trained agent."""
+        if self.algo not in ALGORITHMS:
+            return super()._maybe_normalize(env, eval_env)
+        of_evaluations = {"norm_reward": False, "training": False} if eval_env else {}
+        return VecNormalize(env, **{**self.normalize_kwargs, **of_evaluations}) if self.normalize else env
 
     def objective(self, trial: optuna.Trial) -> float:
         """RL-Zoo's, of a search; a trial that diverges or needs too much memory is one without a value."""

@@ -21,10 +21,10 @@ from torch.utils.tensorboard import SummaryWriter
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd
 from sb3_dtfm.files import replacing
 from sb3_dtfm.finetuning import OnlineDTFM
-from sb3_dtfm.zoo.arguments import UsageError
+from sb3_dtfm.zoo.arguments import START, UsageError
 
-# In a run's folder while it is unfinished: the model as it was, and how the run was started.
-CHECKPOINT, START = "checkpoint.zip", "start.json"
+# In a run's folder while it is unfinished: the model as it was; START beside it says how the run was started.
+CHECKPOINT = "checkpoint.zip"
 # Held by the process that trains it.
 LOCK = ".lock"
 # Beside a model that learns online: its own episodes.
@@ -68,7 +68,10 @@ class Start(NamedTuple):
             )
         try:
             start = cls(**json.loads((run / START).read_text()))
-        except (ValueError, TypeError) as error:
+            strings = [*start.arguments, start.command, *([] if start.tensorboard is None else [start.tensorboard])]
+            if not isinstance(start.arguments, list) or not all(isinstance(each, str) for each in strings):
+                raise TypeError("expected a list of arguments, and the folder of its curves")
+        except (ValueError, TypeError, RecursionError) as error:
             raise UsageError(f"--resume {run}: {START} is damaged: {error}.") from error
         if start.command != command:
             raise UsageError(
