@@ -178,8 +178,11 @@ class OfflineExperimentManager(ExperimentManager):
             return
         evaluations = [callback for callback in self.callbacks if isinstance(callback, EvalCallback)]
         first = self.callbacks.index(evaluations[0]) if evaluations else 0
-        self.callbacks[first:first] = [MeasureRandomActions(evaluations, self.seed), SeedEvaluations(evaluations, self.seed)]
+        random = MeasureRandomActions(evaluations, self.seed, self.signals.end_evaluation)
+        self.callbacks[first:first] = [random, SeedEvaluations(evaluations, self.seed)]
         self.evaluations = evaluations
+        for evaluation in evaluations if self.signals.between_steps else ():
+            self.signals.watch(evaluation)
         self.keeper = KeepCheckpoint(Path(self.save_path), self.signals, self.start)
         self.callbacks += [EvaluateAtStartAndEnd(evaluations), ReplaceEvaluations(evaluations), self.keeper]
 
@@ -204,6 +207,10 @@ class OfflineExperimentManager(ExperimentManager):
                 learning = cast(BaseAlgorithm, SimpleNamespace(learn=learn, env=model.env))  # all that RL-Zoo asks for
             with self.signals.caught():
                 super().learn(learning)
+        except UsageError:
+            assert self.keeper is not None
+            self.keeper.release()
+            raise
         except Exception as error:
             if self.signals.asked:  # Ctrl-C reaches the environments' processes, too
                 return
