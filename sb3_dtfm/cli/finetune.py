@@ -34,13 +34,13 @@ def main(argv: Sequence[str]) -> None:
     resumed, others = resumed_run(argv)
     restored = None
     if resumed is not None:
-        argv = Start.read(resumed, "finetune").arguments
         restored = restored_arguments(resumed, others)
         if restored is None:
             raise UsageError(
                 f"--resume {resumed}: takes no other arguments but --gym-packages and --conf-file, as a run goes on with its "
                 f"own; got {' '.join(others)}."
             )
+        argv = Start.read(resumed, "finetune").arguments
     options, rest = parser.parse_known_args(argv)
     if "-optimize" in rest or "--optimize-hyperparameters" in rest:
         raise UsageError("-optimize: hyperparameters of finetune cannot be searched; -params changes them.")

@@ -122,13 +122,14 @@ def check_settings(settings: Mapping[str, Any], where: str, names: Sequence[str]
 
 
 def _check_class(named: Any, name: str, where: str) -> None:
-    module, _, attribute = named.rpartition(".") if isinstance(named, str) else ("", "", "")
+    module = named.rpartition(".")[0] if isinstance(named, str) else ""
     if name == "policy" and not module:
         return  # an alias, as "MlpPolicy"
+    if not module:
+        raise ValueError(f"{where}: {name} is {named!r}; expected the dotted name of a {CLASSES[name]}.")
     if module not in sys.modules and module.partition(".")[0] not in PACKAGES:
-        mend = f"--gym-packages {module} imports it" if module else "expected a dotted name"
         raise ValueError(
-            f"{where}: {name} names {named!r}, which is imported only where the command names it: {mend}."
+            f"{where}: {name} names {named!r}, which is imported only if you name its module: --gym-packages {module}."
         )
     kind = _import(CLASSES[name])
     try:

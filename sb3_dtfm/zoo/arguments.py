@@ -144,16 +144,22 @@ class Restored(NamedTuple):
                 f"--resume {self.run} --gym-packages {name}."
             )
 
-    def check_config(self, path: str) -> None:
+    def check_config(self, path: str, settings: dict[str, Any] | None = None) -> dict[str, Any]:
         """
         :param path: of settings that the run's folder names
-        :raises UsageError: they did not come with this package, and the user does not name them
+        :param settings: what they say, None before they are read
+        :return: the same with literals, if they did not come with this package and the user does not name them
+        :raises UsageError: such settings would run code
         """
-        if path != self.conf_file and not is_packaged(path):
-            raise UsageError(
-                f"--resume {self.run}: {START} names the settings {path}, which can run code; if you trust them: "
-                f"--resume {self.run} --conf-file {path}."
-            )
+        if path == self.conf_file or is_packaged(path):
+            return settings or {}
+        try:
+            if settings is None and not path.endswith((".yml", ".yaml")):
+                raise ValueError(f"{START} names the settings {path}, which are Python.")
+            return check_settings(settings or {}, path, [*CLASSES, *EVALUATED])
+        except ValueError as error:
+            trust = f"If you trust it: --resume {self.run} --conf-file {path}"
+            raise UsageError(f"--resume {self.run}: {error} {trust}.") from error
 
 
 def import_packages(modules: Sequence[str], where: str = "--gym-packages") -> None:

@@ -64,6 +64,7 @@ class OfflineExperimentManager(ExperimentManager):
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
+        self.restored = restored
         if resumed is not None and self.algo not in ALGORITHMS:  # whose checkpoints are pickles
             raise UsageError(f"--resume {resumed}: runs of {' and '.join(ALGORITHMS)} go on, none of --algo {self.algo}.")
         if restored is not None:
@@ -86,6 +87,8 @@ class OfflineExperimentManager(ExperimentManager):
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """RL-Zoo's; options of the policy may stand beside the algorithm's, and the ReturnToGoWrapper may be left out."""
         hyperparams, saved = super().read_hyperparameters()
+        if self.restored is not None:
+            hyperparams = self.restored.check_config(self.config, hyperparams)
         if self.algo not in ALGORITHMS:
             return hyperparams, saved
         hyperparams = with_policy_options(hyperparams)
