@@ -82,16 +82,14 @@ def check_target_return(target_return: float) -> float:
     The target as a float.
 
     :param target_return: environment reward units
-    :raises ValueError: not a finite number
+    :raises ValueError: not a finite number, or one that float32 cannot hold
     """
-    if isinstance(target_return, bool | str | bytes):
-        raise ValueError(f"target_return must be a finite number, got {target_return!r}.")
     try:
-        value = float(target_return)
-    except TypeError:
+        value = math.nan if isinstance(target_return, bool | str | bytes) else float(target_return)
+    except (TypeError, OverflowError):
         value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(f"target_return must be a finite number, got {target_return!r}.")
+    if not abs(value) <= np.finfo(np.float32).max:
+        raise ValueError(f"target_return must be a finite number of float32, got {target_return!r}.")
     return value
 
 

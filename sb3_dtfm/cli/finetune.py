@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_dtfm.zoo import commands
-from sb3_dtfm.zoo.arguments import UsageError, restored_arguments, resumed_run
+from sb3_dtfm.zoo.arguments import UsageError, check_algorithm, import_packages, restored_arguments, resumed_run
 from sb3_dtfm.zoo.registration import finetuning_config, register
 from sb3_dtfm.zoo.resuming import Start
 
@@ -42,9 +42,13 @@ def main(argv: Sequence[str]) -> None:
             )
         argv = Start.read(resumed, "finetune").arguments
     options, rest = parser.parse_known_args(argv)
+    check_algorithm(options.algo)
+    import_packages(options.gym_packages if restored is None else [])
     if "-optimize" in rest or "--optimize-hyperparameters" in rest:
         raise UsageError("-optimize: hyperparameters of finetune cannot be searched; -params changes them.")
     config = options.conf_file or finetuning_config(options.algo)
+    if options.gym_packages:
+        rest += ["--gym-packages", *options.gym_packages]
     given = ["--algo", options.algo, "--conf-file", str(config), "--eval-episodes", str(options.eval_episodes)]
     if options.eval_freq is not None:
         given += ["--eval-freq", str(options.eval_freq)]
@@ -70,5 +74,6 @@ def _parser() -> argparse.ArgumentParser:
     every = "timesteps between two evaluations; by default a tenth of all: steps with dtfm, else decisions"
     argument("--eval-freq", type=int, metavar="N", help=every)
     argument("--eval-episodes", type=int, default=20, metavar="N", help="of an evaluation; 20 by default")
+    argument("--gym-packages", nargs="+", default=[], help=argparse.SUPPRESS)
     argument("--resume", metavar="RUN", help="go on with an interrupted run of --algo dtfm, as logs/dtfm/HalfCheetah-v5_2")
     return parser

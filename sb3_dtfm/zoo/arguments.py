@@ -9,11 +9,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+import torch as th
 import yaml
-from rl_zoo3.utils import StoreDict
+from rl_zoo3.utils import ALGOS, StoreDict
 
 from sb3_dtfm.algorithms import ALGORITHMS
+from sb3_dtfm.arguments import with_nearest
 from sb3_dtfm.envs import register_gymnasium_robotics
+from sb3_dtfm.envs.return_to_go import check_target_return
 from sb3_dtfm.files import CLASSES, EVALUATED, check_settings, literal
 from sb3_dtfm.finetuning import FINETUNED
 from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, is_packaged, packaged_config
@@ -41,11 +44,15 @@ def asking_for(target_return: float | None, env_wrapper: Any) -> list[dict[Any, 
     :param target_return: environment reward units; None takes what the settings say away
     :param env_wrapper: RL-Zoo's setting: a wrapper, its path, one of these with its arguments, a list of these, or None
     :return: the same wrappers with their arguments; a ReturnToGoWrapper follows where there was none
+    :raises UsageError: no finite return, or no wrapper
     """
+    try:
+        target = {} if target_return is None else {"target_return": check_target_return(target_return)}
+    except ValueError as error:
+        raise UsageError(f"--target-return: {error} `sb3-dtfm inspect DATASET` suggests one.") from error
     wrappers = _with_arguments(env_wrapper)
     if not any(_shows_return_to_go(wrapper) for wrapper, _ in wrappers):
         wrappers.append((WRAPPER, {}))
-    target = {} if target_return is None else {"target_return": target_return}
     asking = []
     for wrapper, arguments in wrappers:
         if _shows_return_to_go(wrapper):
@@ -66,7 +73,11 @@ def asked_for(env_wrapper: Any) -> float | None:
 def _with_arguments(env_wrapper: Any) -> list[tuple[Any, dict[str, Any]]]:
     """Each wrapper, or its path, with its arguments."""
     given = env_wrapper if isinstance(env_wrapper, list) else [env_wrapper] if env_wrapper else []
-    pairs = [next(iter(each.items())) if isinstance(each, dict) else (each, None) for each in given]
+    pairs = [next(iter(each.items()), (None, None)) if isinstance(each, dict) else (each, None) for each in given]
+    if not all(isinstance(wrapper, str | type) and isinstance(kwargs, dict | None) for wrapper, kwargs in pairs):
+        raise UsageError(
+            f"env_wrapper: {env_wrapper!r}; expected a dotted name in quotes, {{name: {{argument: value}}}}, or a list of these."
+        )
     return [(wrapper, arguments or {}) for wrapper, arguments in pairs]
 
 
@@ -95,6 +106,8 @@ def key_values(option: str, texts: Sequence[str], evaluate: Callable[[str], Any]
     for text in texts:
         key, _, value = text.partition(":")
         try:
+            if not key.isidentifier():
+                raise ValueError("there is no name before the colon")
             values[key] = evaluate(value)
         except Exception as error:  # whatever the user's expression raises
             mend = f"; text needs quotes of its own: \"{key}:'{value}'\"" if isinstance(error, NameError | SyntaxError) else ""
@@ -219,6 +232,7 @@ def train_parser() -> argparse.ArgumentParser:
     shared("--algo", default="ppo", help=argparse.SUPPRESS)
     shared("--env", default="CartPole-v1", help=argparse.SUPPRESS)
     shared("-params", "--hyperparams", nargs="+", action="extend", default=[], help=argparse.SUPPRESS)
+    shared("--gym-packages", nargs="+", default=[], help=argparse.SUPPRESS)
     return parser
 
 
@@ -281,8 +295,12 @@ def train_arguments(argv: Sequence[str]) -> list[str]:
     :raises UsageError: a shorthand for an algorithm that knows no dataset, or one that is missing
     """
     options, rest = train_parser().parse_known_args(argv)
+    check_algorithm(options.algo)
     if options.algo == FINETUNED:
         raise UsageError(f"--algo {FINETUNED}: such models come from `sb3-dtfm finetune`; `enjoy` plays them.")
+    if options.dataset_fraction is not None and not 0.0 < options.dataset_fraction <= 1.0:
+        raise UsageError(f"--dataset-fraction: must be a number in (0, 1], got {options.dataset_fraction}.")
+    import_packages(options.gym_packages)
     given = key_values("-params", options.hyperparams)
     conf_file = options.conf_file
     if options.algo in ALGORITHMS and conf_file in PACKAGED_CONFIGS:
@@ -294,12 +312,37 @@ def train_arguments(argv: Sequence[str]) -> list[str]:
     hyperparams = [*options.hyperparams, *(value for _, value in shorthands)]
     if options.algo in ALGORITHMS and options.conf_file in PACKAGED_CONFIGS:
         _check_task(conf_file, options.env, hyperparams)
-    arguments = ["--algo", options.algo, "--env", options.env, *rest]
+    arguments = ["--algo", options.algo, "--env", options.env, *rest, *_packages(options)]
     if conf_file is not None:
         arguments += ["--conf-file", conf_file]
     if hyperparams:
         arguments += ["--hyperparams", *hyperparams]
     return arguments
+
+
+def check_algorithm(algo: str) -> None:
+    """
+    :param algo: RL-Zoo's name
+    :raises UsageError: it knows none of that name
+    """
+    if algo not in ALGOS:
+        nearest = with_nearest([algo.lower()], ALGOS).replace(algo.lower(), algo, 1)
+        raise UsageError(f"--algo {nearest}: expected one of {', '.join(ALGOS)}.")
+
+
+def check_device(device: str | th.device) -> None:
+    """
+    :param device: PyTorch's name
+    :raises UsageError: it knows none of that name
+    """
+    try:
+        th.device("cpu" if device == "auto" else device)
+    except RuntimeError as error:
+        raise UsageError(f"--device {device}: expected auto, cpu, cuda or cuda:N.") from error
+
+
+def _packages(options: argparse.Namespace) -> list[str]:
+    return ["--gym-packages", *options.gym_packages] if options.gym_packages else []
 
 
 def _check_task(conf_file: str, env_id: str, hyperparams: Sequence[str]) -> None:
@@ -348,6 +391,8 @@ def enjoy_parser() -> argparse.ArgumentParser:
     shared = parser.add_argument_group("read on the way to RL-Zoo").add_argument
     shared("--algo", default="ppo", help=argparse.SUPPRESS)
     shared("-f", "--folder", help=argparse.SUPPRESS)
+    shared("--device", default="auto", help=argparse.SUPPRESS)
+    shared("--gym-packages", nargs="+", default=[], help=argparse.SUPPRESS)
     return parser
 
 
@@ -361,8 +406,14 @@ def enjoy_arguments(argv: Sequence[str]) -> tuple[float | None, list[str]]:
     :raises UsageError: a target return for an algorithm that asks for none
     """
     options, rest = enjoy_parser().parse_known_args(argv)
+    check_algorithm(options.algo)
+    check_device(options.device)
+    import_packages(options.gym_packages)
     ours = options.algo in (*ALGORITHMS, FINETUNED)
     if options.target_return is not None and not ours:
         raise UsageError(f"--target-return: for --algo {' and '.join(ALGORITHMS)} only, not for {options.algo}.")
     folder = options.folder or ("logs" if ours else None)
-    return options.target_return, ["--algo", options.algo, *rest, *(["--folder", folder] if folder else [])]
+    asking_for(options.target_return, None)  # refuses what is none
+    arguments = ["--algo", options.algo, "--device", options.device, *rest, *_packages(options)]
+    arguments += ["--folder", folder] if folder else []
+    return options.target_return, arguments

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
+from unittest import mock
 
 import rl_zoo3.enjoy
 import rl_zoo3.train
@@ -114,6 +115,7 @@ def enjoy(arguments: Sequence[str], target_return: float | None = None) -> None:
 
     rl_zoo3.enjoy.get_model_path = find  # type: ignore[assignment]
     rl_zoo3.enjoy.create_test_env = make
+    rl_zoo3.enjoy.StoreDict = StoreValues  # type: ignore[misc]
     _call(rl_zoo3.enjoy.enjoy, "enjoy", arguments)
     model, env_name = found[-1]
     if not holds_pickles(model.path):  # those of RL-Zoo's own algorithms
@@ -129,13 +131,9 @@ def record_video(model: FoundModel, arguments: Sequence[str]) -> None:
     :param model: to act
     :param arguments: of RL-Zoo's `record_video`, but for those that choose a model
     """
-    get_model_path = rl_zoo3.utils.get_model_path
-    rl_zoo3.utils.get_model_path = lambda *_: model
-    rl_zoo3.utils.create_test_env = functools.partial(_without_pickles, model)
-    try:
+    make = functools.partial(_without_pickles, model)
+    with mock.patch.multiple(rl_zoo3.utils, get_model_path=lambda *_: model, create_test_env=make, StoreDict=StoreValues):
         _call(lambda: runpy.run_module("rl_zoo3.record_video", run_name="__main__"), "video", arguments)
-    finally:
-        rl_zoo3.utils.get_model_path, rl_zoo3.utils.create_test_env = get_model_path, create_test_env
 
 
 def _without_pickles(model: FoundModel, *args: Any, **kwargs: Any) -> VecEnv:
@@ -189,10 +187,6 @@ def _runs(folder: Path, env_name: EnvironmentName) -> list[int]:
 
 
 def _call(function: Callable[[], object], command: str, arguments: Sequence[str]) -> None:
-    saved = sys.argv, yaml.UnsafeLoader
-    # By the second one RL-Zoo reads what is in a run's folder.
-    sys.argv, yaml.UnsafeLoader = [f"sb3-dtfm {command}", *arguments], settings_loader()  # type: ignore[misc]
-    try:
+    argv = mock.patch.object(sys, "argv", [f"sb3-dtfm {command}", *arguments])
+    with argv, mock.patch.object(yaml, "UnsafeLoader", settings_loader()):  # by which RL-Zoo reads a run's folder
         function()
-    finally:
-        sys.argv, yaml.UnsafeLoader = saved  # type: ignore[misc]

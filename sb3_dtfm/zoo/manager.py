@@ -17,20 +17,28 @@ import yaml
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_dtfm.algorithms import ALGORITHMS
-from sb3_dtfm.arguments import with_nearest
+from sb3_dtfm.arguments import COUNT, Number, with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.distributed import is_first_process
-from sb3_dtfm.zoo.arguments import Restored, UsageError, asked_for, asking_for
+from sb3_dtfm.files import CLASSES
+from sb3_dtfm.zoo.arguments import Restored, UsageError, asked_for, asking_for, check_device
 from sb3_dtfm.zoo.comparison import MeasureRandomActions, compare
 from sb3_dtfm.zoo.registration import with_policy_options
 from sb3_dtfm.zoo.resuming import CHECKPOINT, KeepCheckpoint, ReplaceEvaluations, Start, StopSignals, go_on
 
 # Keys of its YAML files that no algorithm sees.
 OF_RL_ZOO = ("n_timesteps", "n_envs", "normalize", "frame_stack", "callback", "env_wrapper", "vec_env_wrapper", "env_kwargs")
+
+
+class TrialNumber(int):
+    """Of a study; RL-Zoo takes none for no number, which 0 would be."""
+
+    def __bool__(self) -> bool:
+        return True
 
 
 class TrainingError(RuntimeError):
@@ -65,6 +73,8 @@ class OfflineExperimentManager(ExperimentManager):
     ) -> None:
         super().__init__(*args, **kwargs)
         self.restored = restored
+        self._check_options()
+        self.trial_id = None if self.trial_id is None else TrialNumber(self.trial_id)
         if resumed is not None and self.algo not in ALGORITHMS:  # whose checkpoints are pickles
             raise UsageError(f"--resume {resumed}: runs of {' and '.join(ALGORITHMS)} go on, none of --algo {self.algo}.")
         if restored is not None:
@@ -84,11 +94,43 @@ class OfflineExperimentManager(ExperimentManager):
         if resumed is not None and self.has_checkpoint:
             self.trained_agent, self.continue_training = str(resumed / CHECKPOINT), True
 
+    def _check_options(self) -> None:
+        """
+        :raises UsageError: an option of RL-Zoo's that it would leave aside, or fail with later
+        """
+        numbers = {"-n": self.n_timesteps, "--eval-episodes": self.n_eval_episodes, "--n-eval-envs": self.n_eval_envs}
+        for option, number in numbers.items():
+            if number < 1 and (option, number) != ("-n", -1):  # RL-Zoo's default, the settings' number
+                raise UsageError(f"{option}: must be at least 1, got {number}.")
+        if not self.log_folder:
+            raise UsageError("-f: expected a folder, got ''; . is the current one.")
+        check_device(self.device)
+        study = {"--storage": self.storage, "--study-name": self.study_name, "--trial-id": self.trial_id}
+        missing = [option for option, value in study.items() if value is None]
+        if not self.optimize_hyperparameters and 0 < len(missing) < len(study):
+            raise UsageError(f"{', '.join(missing)}: needed, too, to train with a trial of a study; -optimize makes one.")
+
+    def _check_settings(self, hyperparams: dict[str, Any]) -> None:
+        """
+        :raises UsageError: a setting that RL-Zoo reads itself is none
+        """
+        if not COUNT.accepts(hyperparams.get("n_envs", 1)):
+            raise UsageError(f"n_envs must be {COUNT}, got {hyperparams['n_envs']!r}.")
+        if self.n_timesteps < 1 and not Number(low=1).accepts(hyperparams.get("n_timesteps", 1)):
+            raise UsageError(f"n_timesteps must be {COUNT}, got {hyperparams['n_timesteps']!r}; -n gives another one.")
+        for name in CLASSES:
+            given = hyperparams.get(name)
+            for each in given if isinstance(given, list) else [given]:
+                named = next(iter(each), None) if isinstance(each, dict) else each
+                if not (each is None or isinstance(named, str | type | BaseCallback)):
+                    raise UsageError(f"{name}: expected the dotted name of a {CLASSES[name]} in quotes, got {named!r}.")
+
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """RL-Zoo's; options of the policy may stand beside the algorithm's, and the ReturnToGoWrapper may be left out."""
         hyperparams, saved = super().read_hyperparameters()
         if self.restored is not None:
             hyperparams = self.restored.check_config(self.config, hyperparams)
+        self._check_settings(hyperparams)
         if self.algo not in ALGORITHMS:
             return hyperparams, saved
         hyperparams = with_policy_options(hyperparams)
