@@ -13,6 +13,7 @@ from stable_baselines3.common.env_util import unwrap_wrapper
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, is_vecenv_wrapped, unwrap_vec_normalize
 
+from sb3_dtfm.envs.robotics import warn_of_reward
 from sb3_dtfm.envs.success import reported_success
 
 OBSERVATION = "observation"
@@ -136,6 +137,7 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def __init__(self, env: gym.Env, target_return: float | None = None, keep_pace: bool = True) -> None:
         RecordConstructorArgs.__init__(self, target_return=target_return, keep_pace=keep_pace)
         super().__init__(env)
+        warn_of_reward(env)
         self._time_limit = env.spec.max_episode_steps if keep_pace and env.spec is not None else None
         self.target_return = None if target_return is None else check_target_return(target_return)
         self.observation_space = return_to_go_space(env.observation_space)

@@ -316,5 +316,22 @@ def test_a_vector_of_bytes_can_be_learned_from(tmp_path: Path):
     finally:
         del gym.registry["tests/Ram-v0"]
     assert buffer.observation_space.shape == (6,)
-    assert [len(episode.observations) for episode in dataset] == [10, 10, 10]
-    assert len(buffer) == 27
+    assert [len(episode.observations) for episode in dataset] == [16, 16, 16]
+    assert len(buffer) == 45
+
+
+class Unseeded(Countdown):
+    """Draws its starts from a generator of its own, as Meta-World does."""
+
+    generator = np.random.default_rng(0)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.left[0] = self.generator.integers(1, 41)
+        return self.left.copy(), {}
+
+
+def test_an_environment_that_does_not_start_from_its_seed_is_warned_of(countdown_agent: Path):
+    gym.register("Unseeded-v0", entry_point=Unseeded)
+    with pytest.warns(UserWarning, match="two reset.* start differently, so the recorded seeds do not replay its episodes"):
+        record(countdown_agent, "Unseeded-v0", env_kwargs=None)
