@@ -245,7 +245,7 @@ def check_vec_env(
         while isinstance(each, gym.Wrapper) and not isinstance(each, ReturnToGoWrapper | Monitor):
             if isinstance(each, TimeLimit) and unwrap_wrapper(each, Monitor) is not None:
                 raise ValueError(
-                    f"{name} has its TimeLimit outside ReturnToGoWrapper and Monitor, where no evaluation sees an episode end: "
+                    f"{name} has its TimeLimit outside ReturnToGoWrapper and Monitor, where no evaluation sees its ends: "
                     "write ReturnToGoWrapper(TimeLimit(env, max_episode_steps=N))."
                 )
             each = each.env

@@ -9,8 +9,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
-# Tasks of the Adroit hand whose version 1 adds a tenth of the distance between palm and object instead of subtracting it, with
-# the object: name of the simulator's array and of the task's index into it.
+# Tasks of the Adroit hand whose version 1 adds a tenth of the distance between palm and object instead of subtracting it,
+# with the object: name of the simulator's array and of the task's index into it.
 OBJECTS = {
     "AdroitHandDoor": ("site_xpos", "handle_site_id"),
     "AdroitHandHammer": ("xpos", "obj_body_id"),
@@ -22,8 +22,8 @@ def register_gymnasium_robotics() -> None:
     """
     Make its ids work, as importing it does, where it is installed.
 
-    It is imported when a task may be one of its own, since that takes half a second and MuJoCo, and in silence: its notice is
-    about the tasks that :func:`warn_of_reward` warns of.
+    It is imported when a task may be one of its own, since that takes half a second and MuJoCo, and in silence: its notice
+    is about the tasks that :func:`warn_of_reward` warns of.
     """
     with contextlib.redirect_stderr(io.StringIO()), contextlib.suppress(ImportError):
         import gymnasium_robotics
@@ -40,8 +40,8 @@ def _object(env: gym.Env) -> tuple[str, str] | None:
 
 class AdroitReward(gym.RewardWrapper, RecordConstructorArgs):
     """
-    The reward of Rajeswaran et al. (2018) for version 1 of Adroit's Door, Hammer and Relocate, as in gymnasium-robotics before
-    1.2.1: the distance between palm and object counts against the hand.
+    The reward of Rajeswaran et al. (2018) for version 1 of Adroit's Door, Hammer and Relocate, as in gymnasium-robotics
+    before 1.2.1: the distance between palm and object counts against the hand.
 
     :param env: one of these tasks, with its dense reward
     :raises ValueError: another task
@@ -79,7 +79,7 @@ def warn_of_reward(env: gym.Env) -> None:
         inner = inner.env
     if _object(env) is not None:
         warnings.warn(
-            f"{env.spec.id if env.spec else env} rewards distance between palm and object, where its authors punish it, since "
-            "gymnasium-robotics 1.2.1. sb3_dtfm.envs.AdroitReward(env) has their reward; data of people have it, too.",
+            f"{env.spec.id if env.spec else env} rewards distance between palm and object, where its authors punish it, "
+            "since gymnasium-robotics 1.2.1. sb3_dtfm.envs.AdroitReward(env) has their reward; data of people have it, too.",
             stacklevel=3,
         )

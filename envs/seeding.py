@@ -18,7 +18,7 @@ def warn_of_seeds(env: gym.Env, consequence: str, seed: int = 0) -> None:
     first, second = (copy.deepcopy(env.reset(seed=seed)[0]) for _ in range(2))
     if not data_equivalence(first, second):
         warnings.warn(
-            f"{env.spec.id if env.spec else env}: two reset(seed={seed}) start differently, so {consequence}. An environment "
-            "whose reset passes the seed to super().reset(seed=seed) and draws from self.np_random starts as it is told.",
+            f"{env.spec.id if env.spec else env}: two reset(seed={seed}) start differently, so {consequence}. A task whose "
+            "reset passes the seed to super().reset(seed=seed) and draws from self.np_random starts as it is told.",
             stacklevel=3,
         )

@@ -37,8 +37,8 @@ def main(argv: Sequence[str]) -> None:
         restored = restored_arguments(resumed, others)
         if restored is None:
             raise UsageError(
-                f"--resume {resumed}: takes no other arguments but --gym-packages and --conf-file, as a run goes on with its "
-                f"own; got {' '.join(others)}."
+                f"--resume {resumed}: takes no other arguments but --gym-packages and --conf-file, as a run goes on with "
+                f"its own; got {' '.join(others)}."
             )
         argv = Start.read(resumed, "finetune").arguments
     options, rest = parser.parse_known_args(argv)

@@ -1,4 +1,4 @@
-"""What an RL-Zoo run tells of the environment that its model was trained in, read as data: nothing in its YAML files is run."""
+"""What an RL-Zoo run tells of the environment that its model was trained in, read as data."""
 
 import ast
 import contextlib
@@ -81,13 +81,14 @@ def settings_loader() -> Any:
                 raise ValueError(f"{self.name}: expected a mapping of settings, found a {type(data).__name__}.")
             return check_settings(data, self.name, OF_ACTING)
 
-    prefix = "tag:yaml.org,2002:python/"
-    SettingsLoader.add_constructor(f"{prefix}tuple", lambda loader, node: tuple(loader.construct_sequence(node, True)))
-    SettingsLoader.add_constructor(
-        f"{prefix}object/apply:collections.OrderedDict",
-        lambda loader, node: dict(*loader.construct_sequence(node, True)),
-    )
-    SettingsLoader.add_multi_constructor(f"{prefix}name:", lambda loader, name, node: name)
+    def sequence(loader: Any, node: Any) -> list[Any]:
+        return loader.construct_sequence(node, deep=True)
+
+    tag = "tag:yaml.org,2002:python/"
+    SettingsLoader.add_constructor(f"{tag}tuple", lambda loader, node: tuple(sequence(loader, node)))
+    ordered = f"{tag}object/apply:collections.OrderedDict"
+    SettingsLoader.add_constructor(ordered, lambda loader, node: dict(*sequence(loader, node)))
+    SettingsLoader.add_multi_constructor(f"{tag}name:", lambda loader, name, node: name)
     return SettingsLoader
 
 

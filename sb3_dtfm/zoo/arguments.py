@@ -76,7 +76,7 @@ def _with_arguments(env_wrapper: Any) -> list[tuple[Any, dict[str, Any]]]:
     pairs = [next(iter(each.items()), (None, None)) if isinstance(each, dict) else (each, None) for each in given]
     if not all(isinstance(wrapper, str | type) and isinstance(kwargs, dict | None) for wrapper, kwargs in pairs):
         raise UsageError(
-            f"env_wrapper: {env_wrapper!r}; expected a dotted name in quotes, {{name: {{argument: value}}}}, or a list of these."
+            f"env_wrapper: {env_wrapper!r}; expected a dotted name in quotes, {{name: {{argument: value}}}}, or a list."
         )
     return [(wrapper, arguments or {}) for wrapper, arguments in pairs]
 
@@ -110,7 +110,9 @@ def key_values(option: str, texts: Sequence[str], evaluate: Callable[[str], Any]
                 raise ValueError("there is no name before the colon")
             values[key] = evaluate(value)
         except Exception as error:  # whatever the user's expression raises
-            mend = f"; text needs quotes of its own: \"{key}:'{value}'\"" if isinstance(error, NameError | SyntaxError) else ""
+            mend = (
+                f"; text needs quotes of its own: \"{key}:'{value}'\"" if isinstance(error, NameError | SyntaxError) else ""
+            )
             raise UsageError(f"{option} {text}: expected key:value with a value in Python ({error}){mend}.") from error
     return values
 

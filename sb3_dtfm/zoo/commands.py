@@ -85,11 +85,11 @@ def finetune(
 
 def _train(command: str, manager: Any, arguments: Sequence[str], restored: Restored | None) -> None:
     """RL-Zoo's `train`; what a run's folder says is neither evaluated nor imported."""
-    rl_zoo3.train.ExperimentManager = manager  # type: ignore[misc]
-    rl_zoo3.train.StoreDict = StoreValues if restored is None else StoreLiterals  # type: ignore[misc]
-    packages = importlib if restored is None else SimpleNamespace(import_module=restored.check_package)
-    rl_zoo3.train.importlib = packages  # type: ignore[attr-defined]
-    _call(rl_zoo3.train.train, command, arguments)
+    script: Any = rl_zoo3.train
+    script.ExperimentManager = manager
+    script.StoreDict = StoreValues if restored is None else StoreLiterals
+    script.importlib = importlib if restored is None else SimpleNamespace(import_module=restored.check_package)
+    _call(script.train, command, arguments)
 
 
 def enjoy(arguments: Sequence[str], target_return: float | None = None) -> None:
@@ -113,10 +113,9 @@ def enjoy(arguments: Sequence[str], target_return: float | None = None) -> None:
             envs[-1].env_method("set_target_return", target_return)
         return envs[-1]
 
-    rl_zoo3.enjoy.get_model_path = find  # type: ignore[assignment]
-    rl_zoo3.enjoy.create_test_env = make
-    rl_zoo3.enjoy.StoreDict = StoreValues  # type: ignore[misc]
-    _call(rl_zoo3.enjoy.enjoy, "enjoy", arguments)
+    script: Any = rl_zoo3.enjoy
+    script.get_model_path, script.create_test_env, script.StoreDict = find, make, StoreValues
+    _call(script.enjoy, "enjoy", arguments)
     model, env_name = found[-1]
     if not holds_pickles(model.path):  # those of RL-Zoo's own algorithms
         attributes = {**read_configuration(model.path)["attributes"], "target_return": envs[-1].get_attr("target_return")[0]}

@@ -115,13 +115,13 @@ class StopSignals:
 
         :param evaluation: whenever it runs
         """
-        count_successes = evaluation._log_success_callback
+        count_successes: Any = evaluation._log_success_callback
 
         def after_step(*variables: dict[str, Any]) -> None:
             self.end_evaluation()
             count_successes(*variables)
 
-        evaluation._log_success_callback = after_step  # type: ignore[method-assign]
+        evaluation._log_success_callback = after_step  # type: ignore[method-assign,assignment]
 
     def end_evaluation(self, *_: Any) -> None:
         """
@@ -304,8 +304,8 @@ def _take_up_evaluations(callback: EvalCallback, path: Path, num_timesteps: int)
         model = path.with_name("best_model.zip")
         if model.exists():
             raise UsageError(
-                f"{path}: expected the evaluations up to step {num_timesteps}, without which nobody knows how good {model} is "
-                f"({type(error).__name__}: {error}). Put the file back, or rename {model} to keep it, and resume again."
+                f"{path}: expected the evaluations up to step {num_timesteps}, without which nobody knows how good {model} "
+                f"is ({type(error).__name__}: {error}). Put the file back, or rename {model} to keep it, and resume again."
             ) from error
         return
     callback.evaluations_timesteps = kept["timesteps"]

@@ -108,7 +108,7 @@ def test_the_target_is_settable_through_a_vec_env(vec_env_class: type):
     vec_env.close()
 
 
-@pytest.mark.parametrize("target_return", [np.nan, np.inf, "100", True, [1.0, 2.0]])
+@pytest.mark.parametrize("target_return", [np.nan, np.inf, "100", True, [1.0, 2.0], -1e300, 10**400])
 def test_a_target_that_is_no_finite_number_is_refused(target_return: Any):
     with pytest.raises(ValueError, match="target_return must be a finite number"):
         ReturnToGoWrapper(constant_env(), target_return)

@@ -55,5 +55,7 @@ def test_the_reward_of_the_installed_version_is_warned_of(task, recwarn):
 
 @pytest.mark.parametrize("task", ["AdroitHandPen-v1", "AdroitHandDoorSparse-v1", "HalfCheetah-v5"])
 def test_other_tasks_keep_their_reward(task):
-    with pytest.raises(ValueError, match="AdroitReward expects AdroitHandDoor-v1, AdroitHandHammer-v1, AdroitHandRelocate-v1"):
+    with pytest.raises(
+        ValueError, match="AdroitReward expects AdroitHandDoor-v1, AdroitHandHammer-v1, AdroitHandRelocate-v1"
+    ):
         AdroitReward(gym.make(task))

@@ -284,7 +284,11 @@ class Ram(gym.Env):
     """Shows bytes, as consoles do, a vector of them and a small matrix."""
 
     observation_space = spaces.Dict(
-        {"ram": spaces.Box(0, 255, (6,), np.uint8), "tiles": spaces.Box(0, 255, (4, 5), np.uint8), "x": spaces.Box(-1, 1, (2,))}
+        {
+            "ram": spaces.Box(0, 255, (6,), np.uint8),
+            "tiles": spaces.Box(0, 255, (4, 5), np.uint8),
+            "x": spaces.Box(-1, 1, (2,)),
+        }
     )
     action_space = spaces.Box(-1.0, 1.0, (3,))
 

@@ -81,8 +81,10 @@ def test_tasks_of_the_current_folder_are_found(workplace, monkeypatch):
     register = "gym.register('My-v0', 'gymnasium.envs.mujoco.half_cheetah_v5:HalfCheetahEnv', max_episode_steps=20)"
     Path("my_own_tasks.py").write_text(f"import gymnasium as gym\n{register}\n")
     mine = ["--env", "My-v0", "--gym-packages", "my_own_tasks"]
-    params = ["-params", f"dataset_kwargs:{{'env_id':'My-v0'}}"]
-    command = tiny_training("dtfm", "--dataset", DATASET_ID, "--eval-freq", "2", "--eval-episodes", "1", "--vec-env", "subproc")
+    params = ["-params", "dataset_kwargs:{'env_id':'My-v0'}"]
+    command = tiny_training(
+        "dtfm", "--dataset", DATASET_ID, "--eval-freq", "2", "--eval-episodes", "1", "--vec-env", "subproc"
+    )
     assert main([*command, *params, *mine]) == 0
     assert main([*ENJOY, *mine, "-n", "30"]) == 0
 

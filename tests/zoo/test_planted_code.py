@@ -23,7 +23,18 @@ COMMANDS = {
     "video": ["video", "--algo", "dtfm", *ENV, "-n", "2"],
     "push": ["push", "--algo", "dtfm", *ENV, "-orga", "me", "--repo-folder", "out", "--n-eval-episodes", "1", "--no-render"],
     "sweep": ["sweep", str(RUN), *ENV, "--dataset", DATASET_ID, "--episodes", "1", "--n-envs", "1", "--returns", "1"],
-    "record": ["record", "--algo", "dtfm", "--model", str(RUN), *ENV, "--episodes", "1", "--dataset-id", "tests/planted/b-v0"],
+    "record": [
+        "record",
+        "--algo",
+        "dtfm",
+        "--model",
+        str(RUN),
+        *ENV,
+        "--episodes",
+        "1",
+        "--dataset-id",
+        "tests/planted/b-v0",
+    ],
     "finetune": ["finetune", "--model", str(RUN), *ENV, "--algo", "dtfm", "-n", "20", "--eval-freq", "-1"],
 }
 OF_YAML = {
@@ -71,7 +82,9 @@ def planted(trained, tmp_path, monkeypatch, minari_folder) -> Path:
     shutil.copytree(trained / "logs", tmp_path / "logs")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    Path(f"{PLANTED}.py").write_text("import os\nimport gymnasium\nos.mkdir('ran')\nclass Wrapper(gymnasium.Wrapper): pass\n")
+    Path(f"{PLANTED}.py").write_text(
+        "import os\nimport gymnasium\nos.mkdir('ran')\nclass Wrapper(gymnasium.Wrapper): pass\n"
+    )
     yield RUN / "HalfCheetah-v5"
     sys.modules.pop(PLANTED, None)
 
@@ -106,7 +119,11 @@ def test_a_wrapper_of_the_users_own_is_imported_where_the_command_names_it(plant
 
 
 def test_the_types_that_rl_zoo_writes_are_read(tmp_path):
-    settings = {"normalize": "dict(norm_obs=False)", "policy_kwargs": {"net_arch": (8, 8), "activation_fn": dict}, "a": [None]}
+    settings = {
+        "normalize": "dict(norm_obs=False)",
+        "policy_kwargs": {"net_arch": (8, 8), "activation_fn": dict},
+        "a": [None],
+    }
     (tmp_path / "config.yml").write_text(yaml.dump(OrderedDict(settings)))
     read = read_run(tmp_path)
     assert read["normalize"] == {"norm_obs": False}
@@ -120,7 +137,9 @@ def test_a_literal_is_read(text, value):
     assert literal(text) == value
 
 
-@pytest.mark.parametrize("text", ["os", "dict(**{})", "dict([])", "dict.get(a=1)", "().__class__", "[0]*3", "f'{1}'", "(" * 9999])
+@pytest.mark.parametrize(
+    "text", ["os", "dict(**{})", "dict([])", "dict.get(a=1)", "().__class__", "[0]*3", "f'{1}'", "(" * 9999]
+)
 def test_anything_else_is_not(text):
     with pytest.raises(ValueError, match="literal of Python"):
         literal(text)
@@ -162,7 +181,9 @@ def test_what_started_a_run_runs_nothing_when_it_goes_on(what, command, planted,
     assert not Path("ran").exists()
 
 
-@pytest.mark.parametrize("start", ['{"arguments": "abc"}', '{"arguments": [1]}', "[]", "{", "[" * 9999, '{"arguments": [], "x": 1}'])
+@pytest.mark.parametrize(
+    "start", ['{"arguments": "abc"}', '{"arguments": [1]}', "[]", "{", "[" * 9999, '{"arguments": [], "x": 1}']
+)
 def test_a_damaged_start_is_named(start, planted, capsys):
     (RUN / START).write_text(start)
     assert main(["train", "--resume", str(RUN)]) == 2

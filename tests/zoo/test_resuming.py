@@ -251,7 +251,15 @@ def confuse(path: Path) -> None:
     np.savez(path, timesteps=np.array([0, 10]), results=np.full((3, 2), -1e9), ep_lengths=np.ones((3, 2)))
 
 
-DAMAGES = [Path.unlink, truncate, pickle_them, forget, confuse, lambda path: path.write_bytes(b""), lambda path: path.write_text("x")]
+DAMAGES = [
+    Path.unlink,
+    truncate,
+    pickle_them,
+    forget,
+    confuse,
+    lambda path: path.write_bytes(b""),
+    lambda path: path.write_text("x"),
+]
 
 
 def test_without_its_evaluations_a_run_does_not_replace_its_best_model(straight, workplace, capsys):
