@@ -1,9 +1,6 @@
 """What `sb3-dtfm train` and `enjoy` add to RL-Zoo's own arguments, written in terms of those."""
 
 import argparse
-import importlib
-import os
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +12,7 @@ from rl_zoo3.utils import ALGOS, StoreDict
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.arguments import with_nearest
-from sb3_dtfm.envs import register_gymnasium_robotics
+from sb3_dtfm.envs.packages import import_packages
 from sb3_dtfm.envs.return_to_go import check_target_return
 from sb3_dtfm.files import CLASSES, EVALUATED, check_settings, literal
 from sb3_dtfm.finetuning import FINETUNED
@@ -175,25 +172,6 @@ class Restored(NamedTuple):
         except ValueError as error:
             trust = f"If you trust it: --resume {self.run} --conf-file {path}"
             raise UsageError(f"--resume {self.run}: {error} {trust}.") from error
-
-
-def import_packages(modules: Sequence[str], where: str = "--gym-packages") -> None:
-    """
-    Import what registers tasks, as RL-Zoo's `--gym-packages` does, also from the current folder; gymnasium-robotics needs no
-    mention.
-
-    :param modules: dotted names
-    :param where: they were named, for the message
-    :raises UsageError: there is none of that name
-    """
-    register_gymnasium_robotics()
-    if modules and os.getcwd() not in sys.path and "" not in sys.path:
-        sys.path.append(os.getcwd())  # where `python -m` looks, but no installed command does
-    for module in modules:
-        try:
-            importlib.import_module(module)
-        except ModuleNotFoundError as error:
-            raise UsageError(f"{where} {module}: {error}.") from error
 
 
 def train_parser() -> argparse.ArgumentParser:

@@ -1,5 +1,6 @@
 """A run's folder is data: code that somebody planted in one runs in no command but where SECURITY.md says so."""
 
+import contextlib
 import json
 import pickle
 import shutil
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from stable_baselines3 import PPO
 
 from sb3_dtfm.cli.main import main
 from sb3_dtfm.files import literal, read_run
@@ -92,7 +94,7 @@ def planted(trained, tmp_path, monkeypatch, minari_folder) -> Path:
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_runs_yaml_runs_nothing(command, planted, capsys):
     original = {name: (planted / name).read_text() for name in ("config.yml", "args.yml")}
-    for what, (name, text) in OF_YAML.items():
+    for what, (name, text) in list(OF_YAML.items())[:: 4 if command == "video" else 1]:  # which looks for a renderer
         (planted / name).write_text(text, encoding="latin-1")
         assert main(COMMANDS[command]) == 2, what
         error = capsys.readouterr().err.strip().splitlines()[-1]
@@ -188,3 +190,42 @@ def test_a_damaged_start_is_named(start, planted, capsys):
     (RUN / START).write_text(start)
     assert main(["train", "--resume", str(RUN)]) == 2
     assert "start.json is damaged" in capsys.readouterr().err
+
+
+# What SECURITY.md lists, by command: the user's own arguments, and pickles.
+PPO_ENV = ["--algo", "ppo", "--env", "Pendulum-v1"]
+PPO_RUN = Path("logs/ppo/Pendulum-v1_1")
+STILL_RUNS = {
+    "train -params": tiny_training("dtfm", f"a:{CODE}"),
+    "train --env-kwargs": tiny_training("dtfm", "--env-kwargs", f"a:{CODE}"),
+    "train --conf-file YAML": ["train", *PPO_ENV, "--conf-file", "evil.yml"],
+    "train --conf-file Python": ["train", *PPO_ENV, "--conf-file", "evil.py"],
+    "enjoy --gym-packages": [*COMMANDS["enjoy"], "--gym-packages", PLANTED],
+    "train, statistics in the current folder": ["train", *PPO_ENV, "-n", "8", "--eval-freq", "-1"],
+    "train -i": ["train", *PPO_ENV, "-i", str(PPO_RUN / "Pendulum-v1.zip"), "-n", "8"],
+    "finetune -i": ["finetune", "--model", str(RUN), *ENV, "-i", str(PPO_RUN / "Pendulum-v1.zip"), "-n", "8"],
+    "enjoy --env-kwargs": [*COMMANDS["enjoy"], "--env-kwargs", f"a:{CODE}"],
+    "enjoy, an agent": ["enjoy", *PPO_ENV, "-f", "logs", "--no-render", "-n", "2"],
+    "video, an agent": ["video", *PPO_ENV, "-n", "2"],
+    "record --gym-packages": [*COMMANDS["record"], "--gym-packages", PLANTED],
+    "record, an agent": ["record", *PPO_ENV, "--model", str(PPO_RUN), "--episodes", "1", "--dataset-id", "tests/ran-v0"],
+    "sweep --acting": [*COMMANDS["sweep"], "--acting", f"a:{CODE}"],
+    "benchmark -params": ["benchmark", "--label", "x", "-params", f"a:{CODE}"],
+    "plot plot_from_file": ["plot", "plot_from_file", "-i", "results.pkl"],
+}
+
+
+@pytest.mark.parametrize("what", STILL_RUNS)
+def test_what_security_lists_does_run(what, planted):
+    Path("evil.py").write_text(f"{CODE}\nhyperparams = {{}}\n")
+    Path("evil.yml").write_text(f'default: {{policy_kwargs: "{CODE}", n_timesteps: 8, policy: MlpPolicy}}\n')
+    Path("results.pkl").write_bytes(pickle.dumps(Run()))
+    Path("Pendulum-v1").mkdir()
+    if "current folder" in what:
+        Path("Pendulum-v1/vecnormalize.pkl").write_bytes(pickle.dumps(Run()))
+    agent = PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8, device="cpu")
+    agent.planted = Run()
+    agent.save(PPO_RUN / "Pendulum-v1.zip")
+    with contextlib.suppress(Exception, SystemExit):  # what comes of it is no agent
+        main(STILL_RUNS[what])
+    assert Path("ran").exists()
