@@ -305,9 +305,10 @@ def check_algorithm(algo: str) -> None:
     :param algo: RL-Zoo's name
     :raises UsageError: it knows none of that name
     """
-    if algo not in ALGOS:
-        nearest = with_nearest([algo.lower()], ALGOS).replace(algo.lower(), algo, 1)
-        raise UsageError(f"--algo {nearest}: expected one of {', '.join(ALGOS)}.")
+    known = list(dict.fromkeys([*ALGOS, *ALGORITHMS, FINETUNED]))
+    if algo not in known:
+        nearest = with_nearest([algo.lower()], known).replace(algo.lower(), algo, 1)
+        raise UsageError(f"--algo {nearest}: expected one of {', '.join(known)}.")
 
 
 def check_device(device: str | th.device) -> None:
@@ -371,7 +372,7 @@ def enjoy_parser() -> argparse.ArgumentParser:
     shared = parser.add_argument_group("read on the way to RL-Zoo").add_argument
     shared("--algo", default="ppo", help=argparse.SUPPRESS)
     shared("-f", "--folder", help=argparse.SUPPRESS)
-    shared("--device", default="auto", help=argparse.SUPPRESS)
+    shared("--device", help=argparse.SUPPRESS)
     shared("--gym-packages", nargs="+", default=[], help=argparse.SUPPRESS)
     return parser
 
@@ -387,13 +388,13 @@ def enjoy_arguments(argv: Sequence[str]) -> tuple[float | None, list[str]]:
     """
     options, rest = enjoy_parser().parse_known_args(argv)
     check_algorithm(options.algo)
-    check_device(options.device)
+    check_device(options.device or "auto")
     import_packages(options.gym_packages)
     ours = options.algo in (*ALGORITHMS, FINETUNED)
     if options.target_return is not None and not ours:
         raise UsageError(f"--target-return: for --algo {' and '.join(ALGORITHMS)} only, not for {options.algo}.")
     folder = options.folder or ("logs" if ours else None)
     asking_for(options.target_return, None)  # refuses what is none
-    arguments = ["--algo", options.algo, "--device", options.device, *rest, *_packages(options)]
-    arguments += ["--folder", folder] if folder else []
+    device = ["--device", options.device] if options.device else []
+    arguments = ["--algo", options.algo, *rest, *device, *_packages(options), *(["--folder", folder] if folder else [])]
     return options.target_return, arguments
