@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from sb3_dtfm.envs.robosuite.registration import register_robosuite_envs
-from sb3_dtfm.envs.robotics import register_gymnasium_robotics
+from sb3_dtfm.envs.robotics import AdroitReward, register_gymnasium_robotics, warn_of_reward
 
 if TYPE_CHECKING:
     from sb3_dtfm.envs.return_to_go import (
@@ -27,6 +27,7 @@ __all__ = [
     "OBSERVATION",
     "RETURN_TO_GO",
     "TIMESTEP",
+    "AdroitReward",
     "ReturnToGoWrapper",
     "check_vec_env",
     "flatten_observation_space",
@@ -36,6 +37,7 @@ __all__ = [
     "register_robosuite_envs",
     "return_to_go_space",
     "share_target_return",
+    "warn_of_reward",
 ]
 
 

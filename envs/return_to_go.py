@@ -1,14 +1,19 @@
 """The wrapper that shows a sequence policy its target return and its time step, and the spaces that come with it."""
 
 import math
+import time
 from typing import Any, NamedTuple, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
+from gymnasium.wrappers import TimeLimit
+from stable_baselines3.common.env_util import unwrap_wrapper
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, is_vecenv_wrapped, unwrap_vec_normalize
 
+from sb3_dtfm.envs.robotics import warn_of_reward
 from sb3_dtfm.envs.success import reported_success
 
 OBSERVATION = "observation"
@@ -78,16 +83,14 @@ def check_target_return(target_return: float) -> float:
     The target as a float.
 
     :param target_return: environment reward units
-    :raises ValueError: not a finite number
+    :raises ValueError: not a finite number, or one that float32 cannot hold
     """
-    if isinstance(target_return, bool | str | bytes):
-        raise ValueError(f"target_return must be a finite number, got {target_return!r}.")
     try:
-        value = float(target_return)
-    except TypeError:
+        value = math.nan if isinstance(target_return, bool | str | bytes) else float(target_return)
+    except (TypeError, OverflowError):
         value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(f"target_return must be a finite number, got {target_return!r}.")
+    if not abs(value) <= np.finfo(np.float32).max:
+        raise ValueError(f"target_return must be a finite number of float32, got {target_return!r}.")
     return value
 
 
@@ -119,6 +122,9 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     added up, and `info` has the observations between them, stacked by key, under `BETWEEN`. So whoever decides once for
     several steps does so in each of many parallel environments at its own place in its episode.
 
+    An episode that a `TimeLimit` outside a `Monitor` ends has the `info["episode"]` that the Monitor would have given: SB3's
+    evaluations wait for it.
+
     A task that tells of success by another name, as Adroit's hands do, tells it as `is_success` too, which SB3's
     `EvalCallback` and logs know.
 
@@ -131,9 +137,11 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def __init__(self, env: gym.Env, target_return: float | None = None, keep_pace: bool = True) -> None:
         RecordConstructorArgs.__init__(self, target_return=target_return, keep_pace=keep_pace)
         super().__init__(env)
+        warn_of_reward(env)
         self._time_limit = env.spec.max_episode_steps if keep_pace and env.spec is not None else None
         self.target_return = None if target_return is None else check_target_return(target_return)
         self.observation_space = return_to_go_space(env.observation_space)
+        self._monitor: Any = unwrap_wrapper(env, Monitor)
         self._sorted_space = sort_observation_space(env.observation_space)
         self._episode_target = self._return_to_go = math.nan
         self._timestep = 0
@@ -182,6 +190,9 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         success = reported_success(info)
         if success is not None and "is_success" not in info:  # by which SB3 counts
             info = {**info, "is_success": success}
+        if truncated and not terminated and self._monitor is not None and "episode" not in info:
+            total, seconds = round(sum(self._monitor.rewards), 6), round(time.time() - self._monitor.t_start, 6)
+            info = {**info, "episode": {"r": total, "l": len(self._monitor.rewards), "t": seconds}}
         return self._observe(observation), reward, terminated, truncated, info
 
     def _step_through(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
@@ -235,6 +246,14 @@ def check_vec_env(
             f"{name} must be wrapped in sb3_dtfm.envs.ReturnToGoWrapper, inside any vectorised environment: write {remedy}. "
             f"Its observation space is {env.observation_space}."
         )
+    for each in getattr(env.unwrapped, "envs", ()):
+        while isinstance(each, gym.Wrapper) and not isinstance(each, ReturnToGoWrapper | Monitor):
+            if isinstance(each, TimeLimit) and unwrap_wrapper(each, Monitor) is not None:
+                raise ValueError(
+                    f"{name} has its TimeLimit outside ReturnToGoWrapper and Monitor, where no evaluation sees its ends: "
+                    "write ReturnToGoWrapper(TimeLimit(env, max_episode_steps=N))."
+                )
+            each = each.env
 
 
 def known_task(env: VecEnv) -> Task | None:

@@ -137,6 +137,10 @@ class SequenceModel(BaseAlgorithm):
             if verbose >= 1:
                 print("Wrapping the env in a ReturnToGoWrapper.")
             env = ReturnToGoWrapper(env)
+        if isinstance(env, gym.vector.VectorEnv):  # type: ignore[unreachable]
+            raise ValueError(
+                f"env is a {type(env).__name__}: write make_vec_env(env_id, n_envs) of Stable-Baselines3 instead."
+            )
         vec_env = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         check_vec_env(vec_env)
         check_action_space(vec_env.action_space, "the environment")

@@ -45,7 +45,7 @@ from sb3_dtfm.distributed import (
     local_rank_zero_first,
     n_processes,
 )
-from sb3_dtfm.envs import check_vec_env, known_task, return_to_go_space, share_target_return
+from sb3_dtfm.envs import check_vec_env, known_task, recorded_space, return_to_go_space, share_target_return
 from sb3_dtfm.optimization import (
     BATCHES,
     DROPOUT,

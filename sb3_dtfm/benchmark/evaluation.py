@@ -4,7 +4,7 @@ import re
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_dtfm.benchmark import provenance
 from sb3_dtfm.benchmark.rows import Row, read_rows, write_row
+from sb3_dtfm.envs.seeding import warn_of_seeds
 from sb3_dtfm.envs.success import reported_success
 from sb3_dtfm.files import replacing
 from sb3_dtfm.zoo.comparison import RandomActions
@@ -49,7 +50,11 @@ class SeededEpisodes(gym.Wrapper):
 
     A vector environment resets by itself and without a seed; what an episode starts from would then depend on those before.
     And it steps all of its environments, also those that nobody waits for. One that rests stands at a start.
+
+    The first environment of its kind is reset twice, and a warning says so if it does not start from its seed.
     """
+
+    _checked: ClassVar[set[type]] = set()
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
@@ -66,7 +71,11 @@ class SeededEpisodes(gym.Wrapper):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._rests = self._seeds == []
         if not self._rests or self._start is None:
-            self._start = self.env.reset(seed=self._seeds.pop(0) if self._seeds else seed, options=options)
+            seed = self._seeds.pop(0) if self._seeds else seed
+            if seed is not None and type(self.unwrapped) not in self._checked:
+                self._checked.add(type(self.unwrapped))
+                warn_of_seeds(self.env, "models are compared from different states", seed)
+            self._start = self.env.reset(seed=seed, options=options)
         return self._start
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-from rl_zoo3.utils import create_test_env, get_saved_hyperparams
+from rl_zoo3.utils import create_test_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
@@ -17,7 +17,7 @@ from sb3_dtfm import DTFM
 from sb3_dtfm.benchmark.report.statistics import wilson
 from sb3_dtfm.cli import train
 from sb3_dtfm.cli.plot import plot_learning_curve
-from sb3_dtfm.files import replacing
+from sb3_dtfm.files import read_run, replacing
 from sb3_dtfm.recording.demonstrations import record_demonstrations
 
 ENV_ID = "robosuite/Lift-v0"
@@ -126,13 +126,12 @@ def evaluate_if_missing(run_folder: Path, n_episodes: int) -> dict[str, Any]:
         if result["episodes"] == n_episodes:
             print(f"{path} is there already.")
             return result
-    hyperparams, _ = get_saved_hyperparams(str(run_folder / ENV_NAME))
     env = create_test_env(
         ENV_ID,
         n_envs=min(N_EVALUATION_ENVS, n_episodes),
         seed=EVALUATION_SEED,
         should_render=False,
-        hyperparams=hyperparams,
+        hyperparams=read_run(run_folder / ENV_NAME),
         vec_env_cls=SubprocVecEnv,
     )
     model = DTFM.load(_model_file(run_folder))

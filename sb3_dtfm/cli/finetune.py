@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_dtfm.zoo import commands
-from sb3_dtfm.zoo.arguments import UsageError, resumed_run
+from sb3_dtfm.zoo.arguments import UsageError, check_algorithm, import_packages, restored_arguments, resumed_run
 from sb3_dtfm.zoo.registration import finetuning_config, register
 from sb3_dtfm.zoo.resuming import Start
 
@@ -32,21 +32,28 @@ def main(argv: Sequence[str]) -> None:
         parser.print_help()
         commands.train(["--help"])
     resumed, others = resumed_run(argv)
-    if resumed is not None and not others:
+    restored = None
+    if resumed is not None:
+        restored = restored_arguments(resumed, others)
+        if restored is None:
+            raise UsageError(
+                f"--resume {resumed}: takes no other arguments but --gym-packages and --conf-file, as a run goes on with "
+                f"its own; got {' '.join(others)}."
+            )
         argv = Start.read(resumed, "finetune").arguments
-    elif resumed is not None:
-        raise UsageError(
-            f"--resume {resumed}: takes no other arguments, as a run goes on with its own; got {' '.join(others)}."
-        )
     options, rest = parser.parse_known_args(argv)
+    check_algorithm(options.algo)
+    import_packages(options.gym_packages if restored is None else [])
     if "-optimize" in rest or "--optimize-hyperparameters" in rest:
         raise UsageError("-optimize: hyperparameters of finetune cannot be searched; -params changes them.")
     config = options.conf_file or finetuning_config(options.algo)
+    if options.gym_packages:
+        rest += ["--gym-packages", *options.gym_packages]
     given = ["--algo", options.algo, "--conf-file", str(config), "--eval-episodes", str(options.eval_episodes)]
     if options.eval_freq is not None:
         given += ["--eval-freq", str(options.eval_freq)]
     evaluations_of_a_run = EVALUATIONS_OF_A_RUN if options.eval_freq is None else None
-    commands.finetune([*given, *rest], options.model, options.target_return, argv, resumed, evaluations_of_a_run)
+    commands.finetune([*given, *rest], options.model, options.target_return, argv, resumed, evaluations_of_a_run, restored)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -67,5 +74,6 @@ def _parser() -> argparse.ArgumentParser:
     every = "timesteps between two evaluations; by default a tenth of all: steps with dtfm, else decisions"
     argument("--eval-freq", type=int, metavar="N", help=every)
     argument("--eval-episodes", type=int, default=20, metavar="N", help="of an evaluation; 20 by default")
+    argument("--gym-packages", nargs="+", default=[], help=argparse.SUPPRESS)
     argument("--resume", metavar="RUN", help="go on with an interrupted run of --algo dtfm, as logs/dtfm/HalfCheetah-v5_2")
     return parser

@@ -1,8 +1,9 @@
 """Arguments of the command line that are literals of Python."""
 
 import argparse
-import ast
 from typing import Any
+
+from sb3_dtfm.files import literal
 
 
 def key_value(text: str) -> tuple[str, Any]:
@@ -13,6 +14,6 @@ def key_value(text: str) -> tuple[str, Any]:
     """
     key, _, value = text.partition(":")
     try:
-        return key, ast.literal_eval(value)
-    except (SyntaxError, ValueError):
+        return key, literal(value)
+    except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is no key:value with a number, 'text', list, ... of Python") from None

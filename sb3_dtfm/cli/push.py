@@ -8,12 +8,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from huggingface_sb3 import EnvironmentName
-from rl_zoo3.utils import get_saved_hyperparams
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_dtfm.algorithms import ALGORITHMS
-from sb3_dtfm.files import replacing
+from sb3_dtfm.files import read_run, replacing
 from sb3_dtfm.recording.loading import AgentFiles, find_agent
 from sb3_dtfm.zoo import hub
 from sb3_dtfm.zoo.arguments import import_packages
@@ -52,7 +51,7 @@ def write_repository(folder: Path, repo_id: str, model: FoundModel, options: arg
     :param options: of the command
     """
     env_name: EnvironmentName = options.env
-    hyperparams, _ = get_saved_hyperparams(str(Path(model.run, env_name)))
+    hyperparams = read_run(Path(model.run, env_name))
     agent = find_agent(model.run, env_name.gym_id)
     settings = hub.Settings(options.algo, env_name.gym_id, hub.target_return_of(hyperparams), agent.env_kwargs)
     settings.write(folder)

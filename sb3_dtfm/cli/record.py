@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from sb3_dtfm.cli.literals import key_value
 
 EPILOG = """\
-An agent's files are pickles, and so are VecNormalize's statistics; an RL-Zoo run's YAML files can run code, too. Name those
-that you trust. A run's statistics, environment arguments and wrappers are found whether its folder is named or a zip in it.
+An agent's files are pickles, and so are VecNormalize's statistics. Name those that you trust. A run's statistics, environment
+arguments and wrappers are found whether its folder is named or a zip in it.
 
 examples:
   sb3-dtfm record --algo tqc --model agent.zip --env HalfCheetah-v5 --episodes 100 --dataset-id local/halfcheetah/expert-v0
@@ -26,6 +26,7 @@ AGENT_OPTIONS: dict[str, tuple[bool, dict]] = {
     "env_kwargs": (False, {"nargs": "+", "type": key_value, "metavar": "KEY:VALUE", "help": "of the environment"}),
     "stochastic": (False, {"action": "store_true", "help": "draw actions instead of taking the best"}),
     "n_envs": (False, {"type": int, "metavar": "N", "help": "environments side by side"}),
+    "gym_packages": (False, {"nargs": "+", "metavar": "MODULE", "help": "to import first: tasks, and a run's wrappers"}),
 }
 DEMONSTRATOR_OPTIONS: dict[str, tuple[bool, dict]] = {
     "output": (True, {"metavar": "FILE", "help": "robomimic hdf5 file to write"}),
@@ -76,8 +77,10 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _record_agent(options: argparse.Namespace) -> None:
+    from sb3_dtfm.envs.packages import import_packages
     from sb3_dtfm.recording.agent import record_agent
 
+    import_packages(options.gym_packages or [])
     optional = {} if options.n_envs is None else {"n_envs": options.n_envs}
     dataset = record_agent(
         options.algo,

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from sb3_dtfm.zoo import commands
-from sb3_dtfm.zoo.arguments import resumed_arguments, resumed_run, train_arguments, train_parser
+from sb3_dtfm.zoo.arguments import repeated_arguments, restored_arguments, resumed_run, train_arguments, train_parser
 from sb3_dtfm.zoo.registration import register
 from sb3_dtfm.zoo.resuming import Start
 from sb3_dtfm.zoo.torchrun import joined_processes
@@ -20,9 +20,12 @@ def main(argv: Sequence[str]) -> None:
         train_parser().print_help()
         commands.train(["--help"])
     resumed, others = resumed_run(argv)
+    restored = None
     if resumed is None:
         arguments = train_arguments(others)
     else:
-        arguments = resumed_arguments(resumed, Start.read(resumed).arguments, others)
+        arguments = Start.read(resumed).arguments
+        restored = restored_arguments(resumed, others)
+        arguments = arguments if restored else repeated_arguments(resumed, arguments, others)
     with joined_processes(arguments) as arguments:
-        commands.train(arguments, resumed)
+        commands.train(arguments, resumed, restored)

@@ -11,19 +11,24 @@ from sb3_dtfm.files.model import (
 )
 from sb3_dtfm.files.onnx import write_onnx
 from sb3_dtfm.files.replacing import find_leftovers, hidden_name, replacing
-from sb3_dtfm.files.run import read_run
+from sb3_dtfm.files.run import CLASSES, EVALUATED, check_settings, literal, read_run, settings_loader
 
 __all__ = [
+    "CLASSES",
+    "EVALUATED",
     "ModelFile",
     "ModelFileError",
+    "check_settings",
     "file_name",
     "find_leftovers",
     "hidden_name",
     "holds_pickles",
+    "literal",
     "read_configuration",
     "read_model",
     "read_run",
     "replacing",
+    "settings_loader",
     "write_model",
     "write_onnx",
 ]

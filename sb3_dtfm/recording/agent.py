@@ -17,7 +17,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 from tqdm import tqdm
 
 from sb3_dtfm.data.trajectories import check_action_space
-from sb3_dtfm.envs import register_gymnasium_robotics
+from sb3_dtfm.envs import register_gymnasium_robotics, warn_of_reward
+from sb3_dtfm.envs.seeding import warn_of_seeds
 from sb3_dtfm.recording.episodes import (
     ActFunction,
     EpisodeRecorder,
@@ -96,6 +97,8 @@ def record_agent(
     envs = [files.wrapper(recorder) for recorder in recorders] if files.wrapper else recorders
     try:
         check_action_space(recorders[0].action_space, env_id)
+        warn_of_reward(recorders[0])
+        warn_of_seeds(recorders[0], "the recorded seeds do not replay its episodes")
         space = check_action_space(envs[0].action_space, f"{env_id}, as {files.model.name} sees it")
         model, normalizer = load_fitting_agent(algo, files, envs[0], vec_normalize_path, device)
         act = agent_actions(model, normalizer, deterministic)

@@ -48,7 +48,8 @@ def find_agent(model: str | Path, env_id: str) -> AgentFiles:
     """
     An agent's files, with the settings of its RL-Zoo run if it lies in one.
 
-    A run's YAML and pickle files are loaded as RL-Zoo does it, so they can run code: name runs that you trust.
+    A run's YAML files are read as data. Agents of other algorithms and VecNormalize's statistics are pickles, which can run
+    code: name those that you trust.
 
     :param model: zip file, or folder of an RL-Zoo run (`logs/ppo/HalfCheetah-v5_1`), whose last model is taken
     :param env_id: Gymnasium id
@@ -77,7 +78,7 @@ def _read_run(model: Path, run: Path) -> AgentFiles:
     for key in ("frame_stack", "vec_env_wrapper"):
         if hyperparams.get(key):
             raise ValueError(f"{run / 'config.yml'}: {key} is {hyperparams[key]!r}; agents trained so cannot be recorded.")
-    statistics = run / "vecnormalize.pkl" if hyperparams["normalize"] else None
+    statistics = run / "vecnormalize.pkl" if hyperparams["normalize"] and holds_pickles(model) else None
     return AgentFiles(model, dict(hyperparams["env_kwargs"]), get_wrapper_class(hyperparams), statistics)
 
 

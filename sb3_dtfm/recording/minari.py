@@ -11,10 +11,11 @@ from typing import Any
 import gymnasium as gym
 import minari
 import numpy as np
+from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_dataset import parse_dataset_id
-from minari.dataset.minari_storage import MinariStorage
+from minari.dataset.minari_storage import MinariStorage, is_image_space
 from minari.namespace import create_namespace, list_local_namespaces
 from minari.storage import get_dataset_path
 
@@ -65,7 +66,7 @@ def write_minari(
         storage.update_metadata({"dataset_id": dataset_id, "minari_version": minari.__version__})
         returns = []
         for episode in episodes:
-            buffer = _episode_buffer(episode)
+            buffer = _episode_buffer(episode, env.observation_space)
             _check_space(staging, buffer)
             storage.update_episodes([buffer])
             returns.append(np.sum(episode.rewards))
@@ -114,13 +115,20 @@ def _n_bytes(observations: Any) -> int:
     return np.asarray(observations).nbytes
 
 
-def _episode_buffer(episode: RecordedEpisode) -> EpisodeBuffer:
+def _exact(space: spaces.Space, values: Any) -> Any:
+    """Values of steps in a type that Minari stores as they are: uint8 becomes JPEG, which only images are read back from."""
+    if isinstance(space, spaces.Dict):
+        return {key: _exact(space[key], values[key]) for key in values}
+    return values.astype(np.int16) if values.dtype == np.uint8 and not is_image_space(space) else values
+
+
+def _episode_buffer(episode: RecordedEpisode, space: spaces.Space) -> EpisodeBuffer:
     ends = np.zeros((2, len(episode.actions)), dtype=bool)
     ends[:, -1] = episode.terminated, episode.truncated
     told = [False, *map(bool, episode.reported)]  # as many as observations; the last one tells of the episode
     return EpisodeBuffer(
         seed=episode.seed,
-        observations=stack_observations(episode.observations),
+        observations=_exact(space, stack_observations(episode.observations)),
         actions=np.stack(episode.actions),
         rewards=np.asarray(episode.rewards, dtype=np.float64),
         terminations=ends[0],

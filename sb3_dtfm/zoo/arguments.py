@@ -1,19 +1,22 @@
 """What `sb3-dtfm train` and `enjoy` add to RL-Zoo's own arguments, written in terms of those."""
 
 import argparse
-import importlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
+import torch as th
 import yaml
-from rl_zoo3.utils import StoreDict
+from rl_zoo3.utils import ALGOS, StoreDict
 
 from sb3_dtfm.algorithms import ALGORITHMS
-from sb3_dtfm.envs import register_gymnasium_robotics
+from sb3_dtfm.arguments import with_nearest
+from sb3_dtfm.envs.packages import import_packages
+from sb3_dtfm.envs.return_to_go import check_target_return
+from sb3_dtfm.files import CLASSES, EVALUATED, check_settings, literal
 from sb3_dtfm.finetuning import FINETUNED
-from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, packaged_config
+from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, is_packaged, packaged_config
 
 # In a run's settings.
 WRAPPER = "sb3_dtfm.envs.ReturnToGoWrapper"
@@ -21,6 +24,10 @@ TRAIN_EXAMPLES = """\
   sb3-dtfm train --algo dtfm --env HalfCheetah-v5
   sb3-dtfm train --algo dt --env robosuite/Lift-v0 --dataset lift.hdf5 --dataset-fraction 0.5
 """
+
+
+# In a run's folder: how it was started.
+START = "start.json"
 
 
 class UsageError(ValueError):
@@ -34,11 +41,15 @@ def asking_for(target_return: float | None, env_wrapper: Any) -> list[dict[Any, 
     :param target_return: environment reward units; None takes what the settings say away
     :param env_wrapper: RL-Zoo's setting: a wrapper, its path, one of these with its arguments, a list of these, or None
     :return: the same wrappers with their arguments; a ReturnToGoWrapper follows where there was none
+    :raises UsageError: no finite return, or no wrapper
     """
+    try:
+        target = {} if target_return is None else {"target_return": check_target_return(target_return)}
+    except ValueError as error:
+        raise UsageError(f"--target-return: {error} `sb3-dtfm inspect DATASET` suggests one.") from error
     wrappers = _with_arguments(env_wrapper)
     if not any(_shows_return_to_go(wrapper) for wrapper, _ in wrappers):
         wrappers.append((WRAPPER, {}))
-    target = {} if target_return is None else {"target_return": target_return}
     asking = []
     for wrapper, arguments in wrappers:
         if _shows_return_to_go(wrapper):
@@ -59,7 +70,11 @@ def asked_for(env_wrapper: Any) -> float | None:
 def _with_arguments(env_wrapper: Any) -> list[tuple[Any, dict[str, Any]]]:
     """Each wrapper, or its path, with its arguments."""
     given = env_wrapper if isinstance(env_wrapper, list) else [env_wrapper] if env_wrapper else []
-    pairs = [next(iter(each.items())) if isinstance(each, dict) else (each, None) for each in given]
+    pairs = [next(iter(each.items()), (None, None)) if isinstance(each, dict) else (each, None) for each in given]
+    if not all(isinstance(wrapper, str | type) and isinstance(kwargs, dict | None) for wrapper, kwargs in pairs):
+        raise UsageError(
+            f"env_wrapper: {env_wrapper!r}; expected a dotted name in quotes, {{name: {{argument: value}}}}, or a list."
+        )
     return [(wrapper, arguments or {}) for wrapper, arguments in pairs]
 
 
@@ -68,39 +83,95 @@ def _shows_return_to_go(wrapper: str | type) -> bool:
     return name.rpartition(".")[2] == WRAPPER.rpartition(".")[2]
 
 
-def key_values(option: str, texts: Sequence[str]) -> dict[str, Any]:
+def zoo_value(text: str) -> Any:
+    """A value of the command line, which RL-Zoo evaluates as Python."""
+    parsed = argparse.Namespace()
+    StoreDict([], "values")(argparse.ArgumentParser(), parsed, [f"value:{text}"])
+    return parsed.values["value"]
+
+
+def key_values(option: str, texts: Sequence[str], evaluate: Callable[[str], Any] = zoo_value) -> dict[str, Any]:
     """
-    Keys with their values, which RL-Zoo evaluates as Python.
+    Keys with their values.
 
     :param option: for the message
     :param texts: `key:value` each
+    :param evaluate: makes a value of its text, by default as RL-Zoo does: Python
     :raises UsageError: one cannot be evaluated
     """
     values = {}
     for text in texts:
-        parsed = argparse.Namespace()
+        key, _, value = text.partition(":")
         try:
-            StoreDict([], "values")(argparse.ArgumentParser(), parsed, [text])
+            if not key.isidentifier():
+                raise ValueError("there is no name before the colon")
+            values[key] = evaluate(value)
         except Exception as error:  # whatever the user's expression raises
-            raise UsageError(f"{option} {text}: expected key:value with a value in Python ({error}).") from error
-        values.update(parsed.values)
+            mend = (
+                f"; text needs quotes of its own: \"{key}:'{value}'\"" if isinstance(error, NameError | SyntaxError) else ""
+            )
+            raise UsageError(f"{option} {text}: expected key:value with a value in Python ({error}){mend}.") from error
     return values
 
 
-def import_packages(modules: Sequence[str], where: str = "--gym-packages") -> None:
-    """
-    Import what registers tasks, as RL-Zoo's `--gym-packages` does; gymnasium-robotics needs no mention.
+class StoreValues(argparse.Action):
+    """RL-Zoo's `StoreDict`, with a user's mistake in one line."""
 
-    :param modules: dotted names
-    :param where: they were named, for the message
-    :raises UsageError: there is none of that name
+    def __call__(self, _: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
+        setattr(namespace, self.dest, key_values(str(option), values))
+
+
+class StoreLiterals(argparse.Action):
+    """The same of arguments that others may have written: nothing is evaluated, and classes are known ones."""
+
+    def __call__(self, _: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
+        given, where = key_values(f"{START}: {option}", values, literal), f"{START}: {option}"
+        if self.dest == "hyperparams":
+            setattr(namespace, self.dest, check_settings(given, where, [*CLASSES, *EVALUATED]))
+        else:
+            setattr(namespace, self.dest, check_settings({self.dest: given}, where, [])[self.dest])
+
+
+class Restored(NamedTuple):
     """
-    register_gymnasium_robotics()
-    for module in modules:
+    What the user names beside `--resume RUN`, where all other arguments come from the run's folder.
+
+    :param run: its folder
+    :param packages: of `--gym-packages`
+    :param conf_file: of `--conf-file`, None for none
+    """
+
+    run: Path
+    packages: list[str]
+    conf_file: str | None
+
+    def check_package(self, name: str) -> None:
+        """
+        :param name: of a module that the run's folder names
+        :raises UsageError: the user does not name it
+        """
+        if name not in self.packages:
+            raise UsageError(
+                f"--resume {self.run}: {START} names the package {name}, which is imported only if you name it, too: "
+                f"--resume {self.run} --gym-packages {name}."
+            )
+
+    def check_config(self, path: str, settings: dict[str, Any] | None = None) -> dict[str, Any]:
+        """
+        :param path: of settings that the run's folder names
+        :param settings: what they say, None before they are read
+        :return: the same with literals, if they did not come with this package and the user does not name them
+        :raises UsageError: such settings would run code
+        """
+        if path == self.conf_file or is_packaged(path):
+            return settings or {}
         try:
-            importlib.import_module(module)
-        except ModuleNotFoundError as error:
-            raise UsageError(f"{where} {module}: {error}.") from error
+            if settings is None and not path.endswith((".yml", ".yaml")):
+                raise ValueError(f"{START} names the settings {path}, which are Python.")
+            return check_settings(settings or {}, path, [*CLASSES, *EVALUATED])
+        except ValueError as error:
+            trust = f"If you trust it: --resume {self.run} --conf-file {path}"
+            raise UsageError(f"--resume {self.run}: {error} {trust}.") from error
 
 
 def train_parser() -> argparse.ArgumentParser:
@@ -141,7 +212,26 @@ def train_parser() -> argparse.ArgumentParser:
     shared("--algo", default="ppo", help=argparse.SUPPRESS)
     shared("--env", default="CartPole-v1", help=argparse.SUPPRESS)
     shared("-params", "--hyperparams", nargs="+", action="extend", default=[], help=argparse.SUPPRESS)
+    shared("--gym-packages", nargs="+", default=[], help=argparse.SUPPRESS)
     return parser
+
+
+def restored_arguments(run: Path, others: Sequence[str]) -> Restored | None:
+    """
+    What a user names beside `--resume`, whose packages are imported; None where there are other arguments.
+
+    :param run: its folder
+    :param others: the user's arguments beside `--resume`
+    :raises UsageError: no such package
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--gym-packages", nargs="+", default=[])
+    parser.add_argument("-conf", "--conf-file")
+    options, rest = parser.parse_known_args(others)
+    if rest:
+        return None
+    import_packages(options.gym_packages)
+    return Restored(run, options.gym_packages, options.conf_file)
 
 
 def resumed_run(argv: Sequence[str]) -> tuple[Path | None, list[str]]:
@@ -156,22 +246,21 @@ def resumed_run(argv: Sequence[str]) -> tuple[Path | None, list[str]]:
     return options.resume, others
 
 
-def resumed_arguments(run: Path, started: list[str], others: Sequence[str]) -> list[str]:
+def repeated_arguments(run: Path, started: list[str], others: Sequence[str]) -> list[str]:
     """
     Arguments for RL-Zoo's `train` of a run that goes on.
 
     :param run: its folder
     :param started: what it was started with
-    :param others: the user's arguments beside `--resume`: none, or all of them once more
+    :param others: the user's arguments beside `--resume`: all of them once more
     :raises UsageError: others, of another algorithm or task
     """
-    if not others:
-        return started
     arguments = train_arguments(others)
     of_the_run, given = (train_parser().parse_known_args(each)[0] for each in (started, arguments))
     if (of_the_run.algo, of_the_run.env) != (given.algo, given.env):
         raise UsageError(
-            f"--resume {run}: takes no other arguments; it was started with --algo {of_the_run.algo} --env {of_the_run.env}."
+            f"--resume {run}: takes no other arguments but --gym-packages and --conf-file; it was started with "
+            f"--algo {of_the_run.algo} --env {of_the_run.env}."
         )
     return arguments
 
@@ -186,8 +275,12 @@ def train_arguments(argv: Sequence[str]) -> list[str]:
     :raises UsageError: a shorthand for an algorithm that knows no dataset, or one that is missing
     """
     options, rest = train_parser().parse_known_args(argv)
+    check_algorithm(options.algo)
     if options.algo == FINETUNED:
         raise UsageError(f"--algo {FINETUNED}: such models come from `sb3-dtfm finetune`; `enjoy` plays them.")
+    if options.dataset_fraction is not None and not 0.0 < options.dataset_fraction <= 1.0:
+        raise UsageError(f"--dataset-fraction: must be a number in (0, 1], got {options.dataset_fraction}.")
+    import_packages(options.gym_packages)
     given = key_values("-params", options.hyperparams)
     conf_file = options.conf_file
     if options.algo in ALGORITHMS and conf_file in PACKAGED_CONFIGS:
@@ -199,12 +292,38 @@ def train_arguments(argv: Sequence[str]) -> list[str]:
     hyperparams = [*options.hyperparams, *(value for _, value in shorthands)]
     if options.algo in ALGORITHMS and options.conf_file in PACKAGED_CONFIGS:
         _check_task(conf_file, options.env, hyperparams)
-    arguments = ["--algo", options.algo, "--env", options.env, *rest]
+    arguments = ["--algo", options.algo, "--env", options.env, *rest, *_packages(options)]
     if conf_file is not None:
         arguments += ["--conf-file", conf_file]
     if hyperparams:
         arguments += ["--hyperparams", *hyperparams]
     return arguments
+
+
+def check_algorithm(algo: str) -> None:
+    """
+    :param algo: RL-Zoo's name
+    :raises UsageError: it knows none of that name
+    """
+    known = list(dict.fromkeys([*ALGOS, *ALGORITHMS, FINETUNED]))
+    if algo not in known:
+        nearest = with_nearest([algo.lower()], known).replace(algo.lower(), algo, 1)
+        raise UsageError(f"--algo {nearest}: expected one of {', '.join(known)}.")
+
+
+def check_device(device: str | th.device) -> None:
+    """
+    :param device: PyTorch's name
+    :raises UsageError: it knows none of that name
+    """
+    try:
+        th.device("cpu" if device == "auto" else device)
+    except RuntimeError as error:
+        raise UsageError(f"--device {device}: expected auto, cpu, cuda or cuda:N.") from error
+
+
+def _packages(options: argparse.Namespace) -> list[str]:
+    return ["--gym-packages", *options.gym_packages] if options.gym_packages else []
 
 
 def _check_task(conf_file: str, env_id: str, hyperparams: Sequence[str]) -> None:
@@ -258,6 +377,8 @@ def enjoy_parser() -> argparse.ArgumentParser:
     shared = parser.add_argument_group("read on the way to RL-Zoo").add_argument
     shared("--algo", default="ppo", help=argparse.SUPPRESS)
     shared("-f", "--folder", help=argparse.SUPPRESS)
+    shared("--device", help=argparse.SUPPRESS)
+    shared("--gym-packages", nargs="+", default=[], help=argparse.SUPPRESS)
     return parser
 
 
@@ -271,8 +392,14 @@ def enjoy_arguments(argv: Sequence[str]) -> tuple[float | None, list[str]]:
     :raises UsageError: a target return for an algorithm that asks for none
     """
     options, rest = enjoy_parser().parse_known_args(argv)
+    check_algorithm(options.algo)
+    check_device(options.device or "auto")
+    import_packages(options.gym_packages)
     ours = options.algo in (*ALGORITHMS, FINETUNED)
     if options.target_return is not None and not ours:
         raise UsageError(f"--target-return: for --algo {' and '.join(ALGORITHMS)} only, not for {options.algo}.")
     folder = options.folder or ("logs" if ours else None)
-    return options.target_return, ["--algo", options.algo, *rest, *(["--folder", folder] if folder else [])]
+    asking_for(options.target_return, None)  # refuses what is none
+    device = ["--device", options.device] if options.device else []
+    arguments = ["--algo", options.algo, *rest, *device, *_packages(options), *(["--folder", folder] if folder else [])]
+    return options.target_return, arguments

@@ -1,20 +1,26 @@
 """RL-Zoo's scripts as functions of their arguments, which they read from `sys.argv`."""
 
 import functools
+import importlib
 import re
 import runpy
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
+from unittest import mock
 
 import rl_zoo3.enjoy
 import rl_zoo3.train
 import rl_zoo3.utils
+import yaml
 from huggingface_sb3 import EnvironmentName
 from rl_zoo3.utils import create_test_env, get_model_path
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_dtfm.files import holds_pickles, read_configuration
+from sb3_dtfm.files import holds_pickles, read_configuration, settings_loader
+from sb3_dtfm.zoo.arguments import Restored, StoreLiterals, StoreValues
 from sb3_dtfm.zoo.comparison import EpisodesOf, compare
 from sb3_dtfm.zoo.finetuning import FinetunedManager, OnlineManager
 from sb3_dtfm.zoo.manager import OfflineExperimentManager
@@ -35,18 +41,18 @@ class FoundModel(NamedTuple):
     run: str
 
 
-def train(arguments: Sequence[str], resumed: Path | None = None) -> None:
+def train(arguments: Sequence[str], resumed: Path | None = None, restored: Restored | None = None) -> None:
     """
     Train through :class:`OfflineExperimentManager`.
 
     :param arguments: of RL-Zoo's `train`
     :param resumed: folder of an interrupted run to go on with
+    :param restored: where the arguments come from that folder: what the user named beside it
     :raises TrainingError: training failed in its midst
     :raises SystemExit: SIGTERM has ended it, after what there is was saved
     """
-    manager = functools.partial(OfflineExperimentManager, arguments=list(arguments), resumed=resumed)
-    rl_zoo3.train.ExperimentManager = manager  # type: ignore[misc,assignment]
-    _call(rl_zoo3.train.train, "train", arguments)
+    manager = functools.partial(OfflineExperimentManager, arguments=list(arguments), resumed=resumed, restored=restored)
+    _train("train", manager, arguments, restored)
 
 
 def finetune(
@@ -56,6 +62,7 @@ def finetune(
     started_with: Sequence[str] = (),
     resumed: Path | None = None,
     evaluations_of_a_run: int | None = None,
+    restored: Restored | None = None,
 ) -> None:
     """
     Go on from a DTFM: by :class:`OnlineManager` where it learns itself, else by :class:`FinetunedManager`.
@@ -66,14 +73,23 @@ def finetune(
     :param started_with: the command's own arguments
     :param resumed: folder of an interrupted run to go on with
     :param evaluations_of_a_run: between which a run's timesteps are divided; None where RL-Zoo's arguments say how often
+    :param restored: where the arguments come from that folder: what the user named beside it
     :raises TrainingError: training failed in its midst
     :raises SystemExit: SIGTERM has ended it, after what there is was saved
     """
     kind = OnlineManager if arguments[list(arguments).index("--algo") + 1] == ONLINE else FinetunedManager
     goes_on = dict(base=model, target_return=target_return, evaluations_of_a_run=evaluations_of_a_run)
-    manager = functools.partial(kind, **goes_on, arguments=list(started_with), resumed=resumed)
-    rl_zoo3.train.ExperimentManager = manager  # type: ignore[misc,assignment]
-    _call(rl_zoo3.train.train, "finetune", arguments)
+    manager = functools.partial(kind, **goes_on, arguments=list(started_with), resumed=resumed, restored=restored)
+    _train("finetune", manager, arguments, restored)
+
+
+def _train(command: str, manager: Any, arguments: Sequence[str], restored: Restored | None) -> None:
+    """RL-Zoo's `train`; what a run's folder says is neither evaluated nor imported."""
+    script: Any = rl_zoo3.train
+    script.ExperimentManager = manager
+    script.StoreDict = StoreValues if restored is None else StoreLiterals
+    script.importlib = importlib if restored is None else SimpleNamespace(import_module=restored.check_package)
+    _call(script.train, command, arguments)
 
 
 def enjoy(arguments: Sequence[str], target_return: float | None = None) -> None:
@@ -92,14 +108,14 @@ def enjoy(arguments: Sequence[str], target_return: float | None = None) -> None:
         return found[-1][0]
 
     def make(*args: Any, **kwargs: Any) -> EpisodesOf:
-        envs.append(EpisodesOf(create_test_env(*args, **kwargs)))
+        envs.append(EpisodesOf(_without_pickles(found[-1][0], *args, **kwargs)))
         if target_return is not None:
             envs[-1].env_method("set_target_return", target_return)
         return envs[-1]
 
-    rl_zoo3.enjoy.get_model_path = find  # type: ignore[assignment]
-    rl_zoo3.enjoy.create_test_env = make
-    _call(rl_zoo3.enjoy.enjoy, "enjoy", arguments)
+    script: Any = rl_zoo3.enjoy
+    script.get_model_path, script.create_test_env, script.StoreDict = find, make, StoreValues
+    _call(script.enjoy, "enjoy", arguments)
     model, env_name = found[-1]
     if not holds_pickles(model.path):  # those of RL-Zoo's own algorithms
         attributes = {**read_configuration(model.path)["attributes"], "target_return": envs[-1].get_attr("target_return")[0]}
@@ -114,12 +130,14 @@ def record_video(model: FoundModel, arguments: Sequence[str]) -> None:
     :param model: to act
     :param arguments: of RL-Zoo's `record_video`, but for those that choose a model
     """
-    get_model_path = rl_zoo3.utils.get_model_path
-    rl_zoo3.utils.get_model_path = lambda *_: model
-    try:
+    make = functools.partial(_without_pickles, model)
+    with mock.patch.multiple(rl_zoo3.utils, get_model_path=lambda *_: model, create_test_env=make, StoreDict=StoreValues):
         _call(lambda: runpy.run_module("rl_zoo3.record_video", run_name="__main__"), "video", arguments)
-    finally:
-        rl_zoo3.utils.get_model_path = get_model_path
+
+
+def _without_pickles(model: FoundModel, *args: Any, **kwargs: Any) -> VecEnv:
+    """RL-Zoo's `create_test_env`; VecNormalize's pickled statistics are loaded only beside a model that is a pickle, too."""
+    return create_test_env(*args, **kwargs if holds_pickles(model.path) else {**kwargs, "stats_path": None})
 
 
 def plot(name: str, arguments: Sequence[str]) -> None:
@@ -168,9 +186,6 @@ def _runs(folder: Path, env_name: EnvironmentName) -> list[int]:
 
 
 def _call(function: Callable[[], object], command: str, arguments: Sequence[str]) -> None:
-    saved = sys.argv
-    sys.argv = [f"sb3-dtfm {command}", *arguments]
-    try:
+    argv = mock.patch.object(sys, "argv", [f"sb3-dtfm {command}", *arguments])
+    with argv, mock.patch.object(yaml, "UnsafeLoader", settings_loader()):  # by which RL-Zoo reads a run's folder
         function()
-    finally:
-        sys.argv = saved

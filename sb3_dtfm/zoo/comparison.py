@@ -1,6 +1,6 @@
 """Compare a model's returns with its target return and the recorded returns: printed at the end of `train` and `enjoy`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,18 +45,20 @@ class MeasureRandomActions(BaseCallback):
 
     :param eval_callbacks: the evaluations, of which the first counts
     :param seed: of the actions
+    :param after_step: called after each step
     """
 
-    def __init__(self, eval_callbacks: list[EvalCallback], seed: int) -> None:
+    def __init__(self, eval_callbacks: list[EvalCallback], seed: int, after_step: Callable[..., None] | None = None) -> None:
         super().__init__()
         self.eval_callbacks = eval_callbacks
         self.seed = seed
+        self.after_step = after_step
 
     def _on_training_start(self) -> None:
         model: Any = self.model
         for evaluation in self.eval_callbacks[:1]:
             random: Any = RandomActions(evaluation.eval_env, self.seed)
-            mean: Any = evaluate_policy(random, evaluation.eval_env, N_RANDOM_EPISODES)[0]
+            mean: Any = evaluate_policy(random, evaluation.eval_env, N_RANDOM_EPISODES, callback=self.after_step)[0]
             model.return_reference = model.return_reference._replace(random=float(mean))
 
     def _on_step(self) -> bool:

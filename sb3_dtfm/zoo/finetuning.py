@@ -157,7 +157,10 @@ class FinetuningManager(OfflineExperimentManager):
         if self.target_return is not None:
             hyperparams["env_wrapper"] = asking_for(self.target_return, hyperparams.get("env_wrapper"))
         if not hyperparams.get("env_wrapper"):
-            raise UsageError(f"--target-return: needed, as {self.base} does not tell what return was asked for.")
+            raise UsageError(
+                f"--target-return R: needed, as {self.base} does not tell what return was asked for; "
+                "`sb3-dtfm inspect DATASET` suggests one."
+            )
         if self.evaluations_of_a_run is not None:
             n_timesteps = self.n_timesteps if self.n_timesteps > 0 else hyperparams["n_timesteps"]
             self.eval_freq = max(int(n_timesteps) // self.evaluations_of_a_run, 1)

@@ -17,19 +17,28 @@ import yaml
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_dtfm.algorithms import ALGORITHMS
-from sb3_dtfm.arguments import with_nearest
+from sb3_dtfm.arguments import COUNT, Number, with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.distributed import is_first_process
-from sb3_dtfm.zoo.arguments import UsageError, asked_for, asking_for
+from sb3_dtfm.files import CLASSES
+from sb3_dtfm.zoo.arguments import Restored, UsageError, asked_for, asking_for, check_device
 from sb3_dtfm.zoo.comparison import MeasureRandomActions, compare
 from sb3_dtfm.zoo.registration import with_policy_options
 from sb3_dtfm.zoo.resuming import CHECKPOINT, KeepCheckpoint, ReplaceEvaluations, Start, StopSignals, go_on
 
 # Keys of its YAML files that no algorithm sees.
 OF_RL_ZOO = ("n_timesteps", "n_envs", "normalize", "frame_stack", "callback", "env_wrapper", "vec_env_wrapper", "env_kwargs")
+
+
+class TrialNumber(int):
+    """Of a study; RL-Zoo takes none for no number, which 0 would be."""
+
+    def __bool__(self) -> bool:
+        return True
 
 
 class TrainingError(RuntimeError):
@@ -49,12 +58,27 @@ class OfflineExperimentManager(ExperimentManager):
 
     :param arguments: what the command was called with
     :param resumed: folder of a run to go on with, instead of a new one
+    :param restored: where the arguments come from that folder: what the user named beside it
     """
 
     command = "train"
 
-    def __init__(self, *args: Any, arguments: Sequence[str] = (), resumed: Path | None = None, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        *args: Any,
+        arguments: Sequence[str] = (),
+        resumed: Path | None = None,
+        restored: Restored | None = None,
+        **kwargs: Any,
+    ) -> None:
         super().__init__(*args, **kwargs)
+        self.restored = restored
+        self._check_options()
+        self.trial_id = None if self.trial_id is None else TrialNumber(self.trial_id)
+        if resumed is not None and self.algo not in ALGORITHMS:  # whose checkpoints are pickles
+            raise UsageError(f"--resume {resumed}: runs of {' and '.join(ALGORITHMS)} go on, none of --algo {self.algo}.")
+        if restored is not None:
+            restored.check_config(self.config)
         self.valueless: list[str] = []  # why trials of a search have no value
         self.signals = StopSignals(between_steps=self.algo in ALGORITHMS)
         self.keeper: KeepCheckpoint | None = None
@@ -70,9 +94,43 @@ class OfflineExperimentManager(ExperimentManager):
         if resumed is not None and self.has_checkpoint:
             self.trained_agent, self.continue_training = str(resumed / CHECKPOINT), True
 
+    def _check_options(self) -> None:
+        """
+        :raises UsageError: an option of RL-Zoo's that it would leave aside, or fail with later
+        """
+        numbers = {"-n": self.n_timesteps, "--eval-episodes": self.n_eval_episodes, "--n-eval-envs": self.n_eval_envs}
+        for option, number in numbers.items():
+            if number < 1 and (option, number) != ("-n", -1):  # RL-Zoo's default, the settings' number
+                raise UsageError(f"{option}: must be at least 1, got {number}.")
+        if not self.log_folder:
+            raise UsageError("-f: expected a folder, got ''; . is the current one.")
+        check_device(self.device)
+        study = {"--storage": self.storage, "--study-name": self.study_name, "--trial-id": self.trial_id}
+        missing = [option for option, value in study.items() if value is None]
+        if not self.optimize_hyperparameters and 0 < len(missing) < len(study):
+            raise UsageError(f"{', '.join(missing)}: needed, too, to train with a trial of a study; -optimize makes one.")
+
+    def _check_settings(self, hyperparams: dict[str, Any]) -> None:
+        """
+        :raises UsageError: a setting that RL-Zoo reads itself is none
+        """
+        if not COUNT.accepts(hyperparams.get("n_envs", 1)):
+            raise UsageError(f"n_envs must be {COUNT}, got {hyperparams['n_envs']!r}.")
+        if self.n_timesteps < 1 and not Number(low=1).accepts(hyperparams.get("n_timesteps", 1)):
+            raise UsageError(f"n_timesteps must be {COUNT}, got {hyperparams['n_timesteps']!r}; -n gives another one.")
+        for name in CLASSES:
+            given = hyperparams.get(name)
+            for each in given if isinstance(given, list) else [given]:
+                named = next(iter(each), None) if isinstance(each, dict) else each
+                if not (each is None or isinstance(named, str | type | BaseCallback)):
+                    raise UsageError(f"{name}: expected the dotted name of a {CLASSES[name]} in quotes, got {named!r}.")
+
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """RL-Zoo's; options of the policy may stand beside the algorithm's, and the ReturnToGoWrapper may be left out."""
         hyperparams, saved = super().read_hyperparameters()
+        if self.restored is not None:
+            hyperparams = self.restored.check_config(self.config, hyperparams)
+        self._check_settings(hyperparams)
         if self.algo not in ALGORITHMS:
             return hyperparams, saved
         hyperparams = with_policy_options(hyperparams)
@@ -123,6 +181,13 @@ class OfflineExperimentManager(ExperimentManager):
         if unknown:
             raise UsageError(f"{with_nearest(unknown, known)}: no hyperparameter of {self.algo}.") from error
 
+    def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
+        """RL-Zoo's; dt and dtfm need none of the pickled statistics that it would load from beside a trained agent."""
+        if self.algo not in ALGORITHMS:
+            return super()._maybe_normalize(env, eval_env)
+        of_evaluations = {"norm_reward": False, "training": False} if eval_env else {}
+        return VecNormalize(env, **{**self.normalize_kwargs, **of_evaluations}) if self.normalize else env
+
     def objective(self, trial: optuna.Trial) -> float:
         """RL-Zoo's, of a search; a trial that diverges or needs too much memory is one without a value."""
         try:
@@ -158,8 +223,11 @@ class OfflineExperimentManager(ExperimentManager):
             return
         evaluations = [callback for callback in self.callbacks if isinstance(callback, EvalCallback)]
         first = self.callbacks.index(evaluations[0]) if evaluations else 0
-        self.callbacks[first:first] = [MeasureRandomActions(evaluations, self.seed), SeedEvaluations(evaluations, self.seed)]
+        random = MeasureRandomActions(evaluations, self.seed, self.signals.end_evaluation)
+        self.callbacks[first:first] = [random, SeedEvaluations(evaluations, self.seed)]
         self.evaluations = evaluations
+        for evaluation in evaluations if self.signals.between_steps else ():
+            self.signals.watch(evaluation)
         self.keeper = KeepCheckpoint(Path(self.save_path), self.signals, self.start)
         self.callbacks += [EvaluateAtStartAndEnd(evaluations), ReplaceEvaluations(evaluations), self.keeper]
 
@@ -184,6 +252,10 @@ class OfflineExperimentManager(ExperimentManager):
                 learning = cast(BaseAlgorithm, SimpleNamespace(learn=learn, env=model.env))  # all that RL-Zoo asks for
             with self.signals.caught():
                 super().learn(learning)
+        except UsageError:
+            assert self.keeper is not None
+            self.keeper.release()
+            raise
         except Exception as error:
             if self.signals.asked:  # Ctrl-C reaches the environments' processes, too
                 return

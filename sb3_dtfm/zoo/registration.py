@@ -46,6 +46,11 @@ def packaged_config(algo: str, name: str | None = None) -> Path:
     return own if own.is_file() else Path(str(folder.joinpath("dt.yml")))
 
 
+def is_packaged(path: str) -> bool:
+    """Whether settings came with the package."""
+    return Path(str(resources.files(PACKAGED_CONFIGS[None]))).resolve() in Path(path).resolve().parents
+
+
 def finetuning_config(algo: str) -> Path:
     """
     Hyperparameter file that comes with the package, of an algorithm that `finetune` takes.

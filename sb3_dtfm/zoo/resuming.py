@@ -21,16 +21,16 @@ from torch.utils.tensorboard import SummaryWriter
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd
 from sb3_dtfm.files import replacing
 from sb3_dtfm.finetuning import OnlineDTFM
-from sb3_dtfm.zoo.arguments import UsageError
+from sb3_dtfm.zoo.arguments import START, UsageError
 
-# In a run's folder while it is unfinished: the model as it was, and how the run was started.
-CHECKPOINT, START = "checkpoint.zip", "start.json"
+# In a run's folder while it is unfinished: the model as it was; START beside it says how the run was started.
+CHECKPOINT = "checkpoint.zip"
 # Held by the process that trains it.
 LOCK = ".lock"
 # Beside a model that learns online: its own episodes.
 EPISODES = "episodes.npz"
 CHECKPOINT_INTERVAL = 60.0  # seconds of training that a killed run loses at most
-STOPPING = b"\nStopping after this gradient step, or the evaluation that runs; once more stops at once.\n"
+STOPPING = b"\nStopping after this gradient step, or in the midst of an evaluation; once more stops at once.\n"
 
 
 class Start(NamedTuple):
@@ -68,7 +68,10 @@ class Start(NamedTuple):
             )
         try:
             start = cls(**json.loads((run / START).read_text()))
-        except (ValueError, TypeError) as error:
+            strings = [*start.arguments, start.command, *([] if start.tensorboard is None else [start.tensorboard])]
+            if not isinstance(start.arguments, list) or not all(isinstance(each, str) for each in strings):
+                raise TypeError("expected a list of arguments, and the folder of its curves")
+        except (ValueError, TypeError, RecursionError) as error:
             raise UsageError(f"--resume {run}: {START} is damaged: {error}.") from error
         if start.command != command:
             raise UsageError(
@@ -79,7 +82,8 @@ class Start(NamedTuple):
 
 class StopSignals:
     """
-    Ctrl-C and SIGTERM end training between two gradient steps: what is saved is a state that training can go on from.
+    Ctrl-C and SIGTERM end training between two gradient steps, or an evaluation: what is saved is a state that training can
+    go on from.
 
     The second one interrupts at once. Where several processes train together, signals do what they did.
 
@@ -104,6 +108,29 @@ class StopSignals:
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+    def watch(self, evaluation: EvalCallback) -> None:
+        """
+        Have the signals end an evaluation, too; a resumed run repeats it.
+
+        :param evaluation: whenever it runs
+        """
+        count_successes: Any = evaluation._log_success_callback
+
+        def after_step(*variables: dict[str, Any]) -> None:
+            self.end_evaluation()
+            count_successes(*variables)
+
+        evaluation._log_success_callback = after_step  # type: ignore[method-assign,assignment]
+
+    def end_evaluation(self, *_: Any) -> None:
+        """
+        Between two steps of an evaluation, as `evaluate_policy` calls it.
+
+        :raises KeyboardInterrupt: one of them has come
+        """
+        if self.asked:
+            raise KeyboardInterrupt
 
     def _ask(self, number: int, _: Any) -> None:
         self.terminated |= number == signal.SIGTERM
@@ -149,6 +176,9 @@ class KeepCheckpoint(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._saved_at = time.monotonic()
+        self._write_start()
+
+    def _write_start(self) -> None:
         self.start._replace(tensorboard=self.logger.dir if self.model.tensorboard_log else None).write(self.path.parent)
 
     def _on_step(self) -> bool:
@@ -167,6 +197,7 @@ class KeepCheckpoint(BaseCallback):
         if isinstance(self.model, OnlineDTFM) and self.model.replay_buffer is not None:
             self.model.save_replay_buffer(self.path.with_name(EPISODES))
         self.model.save(self.path)
+        self._write_start()  # which is not there yet if the first evaluation was ended
         self._saved_at = time.monotonic()
 
     def remove(self) -> None:
@@ -196,6 +227,11 @@ class ReplaceEvaluations(BaseCallback):
                 beside = whole.with_name(f".{whole.name}")
                 self.files.append((beside, whole))
                 evaluation.log_path = str(beside.with_suffix(""))  # NumPy adds it
+
+    def drop_unfinished(self) -> None:
+        """What a killed process has left is perhaps not whole."""
+        for beside, _ in self.files:
+            beside.unlink(missing_ok=True)
 
     def _on_training_start(self) -> None:
         self._replace()
@@ -227,14 +263,21 @@ def go_on(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], start: Start)
     :param model: of the checkpoint, or new where there was none
     :param callbacks: of the run
     :param start: how it was started
+    :raises UsageError: evaluations are missing
     """
     n_steps = model.num_timesteps
+    was_ended = False  # the checkpoint's evaluation, in its midst
+    for callback in callbacks:
+        if isinstance(callback, ReplaceEvaluations):
+            callback.drop_unfinished()
     for callback in callbacks if n_steps else ():
         callback.n_calls = n_steps // (model.n_envs if isinstance(model, OnlineDTFM) else 1)
-        if isinstance(callback, EvaluateAtStartAndEnd):
+        if isinstance(callback, EvaluateAtStartAndEnd) and not was_ended:
             callback.go_on(n_steps)
         elif isinstance(callback, EvalCallback) and callback.log_path is not None:
             _take_up_evaluations(callback, _evaluations(callback), n_steps)
+            is_due = callback.eval_freq > 0 and callback.n_calls % callback.eval_freq == 0
+            was_ended = not isinstance(model, OnlineDTFM) and is_due and n_steps not in callback.evaluations_timesteps
     if start.tensorboard is not None:
         logger = configure(start.tensorboard, ["stdout", "tensorboard"] if model.verbose else ["tensorboard"])
         for output in logger.output_formats:
@@ -246,13 +289,26 @@ def go_on(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], start: Start)
 
 
 def _take_up_evaluations(callback: EvalCallback, path: Path, num_timesteps: int) -> None:
-    """Those up to the checkpoint; the run comes to the others again."""
+    """
+    Those up to the checkpoint; the run comes to the others again.
+
+    :raises UsageError: there are none to tell how good the best model is
+    """
     try:
         with np.load(path, allow_pickle=False) as saved:
             kept = {name: saved[name][saved["timesteps"] <= num_timesteps].tolist() for name in saved.files}
-    except (OSError, ValueError, KeyError, EOFError):  # none yet, or damaged
+        best = float(max(map(np.mean, kept["results"])))
+        if not np.isfinite(best) or len({len(kept[name]) for name in ("timesteps", "results", "ep_lengths")}) > 1:
+            raise ValueError("the evaluations do not go together")
+    except Exception as error:  # a damaged archive can raise anything
+        model = path.with_name("best_model.zip")
+        if model.exists():
+            raise UsageError(
+                f"{path}: expected the evaluations up to step {num_timesteps}, without which nobody knows how good {model} "
+                f"is ({type(error).__name__}: {error}). Put the file back, or rename {model} to keep it, and resume again."
+            ) from error
         return
     callback.evaluations_timesteps = kept["timesteps"]
     callback.evaluations_results, callback.evaluations_length = kept["results"], kept["ep_lengths"]
     callback.evaluations_successes = kept.get("successes", [])
-    callback.best_mean_reward = float(max(map(np.mean, kept["results"]), default=-np.inf))
+    callback.best_mean_reward = best

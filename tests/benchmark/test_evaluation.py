@@ -1,6 +1,7 @@
 """Evaluation counts each initial state once, whatever the number of environments and the lengths of episodes."""
 
 import time
+import warnings
 from typing import Any
 
 import gymnasium as gym
@@ -188,3 +189,24 @@ def test_rl_zoo_makes_the_callback_from_plain_data(tmp_path, row):
     (callback,) = get_callback_list(yaml.safe_load(text))
     assert isinstance(callback, EvaluationCallback)
     assert callback.row["settings"] == row["settings"]
+
+
+class Unseeded(Countdown):
+    """Draws its starts from a generator of its own, as Meta-World does."""
+
+    def reset(self, *, seed=None, options=None):
+        return super().reset(seed=int(self.generator.integers(1, 1000)))
+
+    generator = np.random.default_rng(0)
+
+
+def test_an_environment_that_does_not_start_from_its_seed_is_warned_of_once():
+    envs = [SeededEpisodes(Unseeded()) for _ in range(2)]
+    for env in envs:
+        env.set_episode_seeds([3, 4])
+    with pytest.warns(UserWarning, match="start differently, so models are compared from different states"):
+        envs[0].reset()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for env in envs:
+            env.reset()

@@ -9,14 +9,17 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_dtfm.data import load_minari
 from sb3_dtfm.envs import (
     ReturnToGoWrapper,
+    check_vec_env,
     flatten_observation_space,
     known_task,
     register_gymnasium_robotics,
@@ -105,7 +108,7 @@ def test_the_target_is_settable_through_a_vec_env(vec_env_class: type):
     vec_env.close()
 
 
-@pytest.mark.parametrize("target_return", [np.nan, np.inf, "100", True, [1.0, 2.0]])
+@pytest.mark.parametrize("target_return", [np.nan, np.inf, "100", True, [1.0, 2.0], -1e300, 10**400])
 def test_a_target_that_is_no_finite_number_is_refused(target_return: Any):
     with pytest.raises(ValueError, match="target_return must be a finite number"):
         ReturnToGoWrapper(constant_env(), target_return)
@@ -254,3 +257,26 @@ def test_the_task_is_known_where_its_whole_spec_cannot_leave_a_process(vec_env_c
     bare = gym.make("Pendulum-v1").unwrapped
     bare.spec = None
     assert known_task(DummyVecEnv([lambda: ReturnToGoWrapper(bare, target_return=0.0)])) is None
+
+
+@pytest.mark.parametrize("vec_env_class", [DummyVecEnv, SubprocVecEnv])
+def test_an_evaluation_ends_where_a_time_limit_stands_outside_the_monitor(vec_env_class):
+    def make() -> gym.Env:
+        bare = ConstantReward(spaces.Box(-1.0, 1.0, (2,)), np.zeros(2, np.float32))
+        return ReturnToGoWrapper(TimeLimit(Monitor(bare), 7), 1.0)
+
+    env = vec_env_class([make])
+    check_vec_env(env)
+    model = PPO("MultiInputPolicy", env, n_steps=8, batch_size=8, device="cpu")
+    returns, lengths = evaluate_policy(model, env, 2, return_episode_rewards=True)
+    env.close()
+    assert returns == pytest.approx([0.7, 0.7])
+    assert lengths == [7, 7]
+
+
+def test_a_time_limit_outside_of_everything_is_refused():
+    bare = ConstantReward(spaces.Box(-1.0, 1.0, (2,)), np.zeros(2, np.float32))
+    with pytest.raises(ValueError, match=r"write ReturnToGoWrapper\(TimeLimit\(env, max_episode_steps=N\)\)"):
+        check_vec_env(DummyVecEnv([lambda: TimeLimit(ReturnToGoWrapper(Monitor(bare), 1.0), 7)]))
+    check_vec_env(DummyVecEnv([lambda: Monitor(TimeLimit(ReturnToGoWrapper(bare, 1.0), 7))]))
+    check_vec_env(DummyVecEnv([lambda: TimeLimit(ReturnToGoWrapper(bare, 1.0), 7)]))

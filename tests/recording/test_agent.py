@@ -8,12 +8,15 @@ import minari
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit, TransformObservation
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_dtfm.data import DatasetError, load_minari
-from sb3_dtfm.recording.agent import record_agent
+from sb3_dtfm.recording.agent import random_actions, record_agent
+from sb3_dtfm.recording.episodes import EpisodeRecorder, run_episodes
+from sb3_dtfm.recording.minari import write_minari
 
 AGENTS = Path(__file__).parents[2].parent / "shared" / "agents"
 SHORT = {"max_episode_steps": 15}
@@ -275,3 +278,64 @@ def test_a_trained_agent_is_recorded_with_its_return():
     assert buffer.episode_returns.mean() == pytest.approx(12_146, rel=0.05)
     assert buffer.score_reference is not None
     assert buffer.score_reference.minimum == pytest.approx(-280, abs=100)
+
+
+class Ram(gym.Env):
+    """Shows bytes, as consoles do, a vector of them and a small matrix."""
+
+    observation_space = spaces.Dict(
+        {
+            "ram": spaces.Box(0, 255, (6,), np.uint8),
+            "tiles": spaces.Box(0, 255, (4, 5), np.uint8),
+            "x": spaces.Box(-1, 1, (2,)),
+        }
+    )
+    action_space = spaces.Box(-1.0, 1.0, (3,))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], dict]:
+        super().reset(seed=seed)
+        if seed is not None:
+            self.observation_space.seed(seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        return self.observation_space.sample(), 1.0, False, False, {}
+
+
+def test_bytes_are_read_back_as_they_were():
+    env = TimeLimit(EpisodeRecorder(Ram()), 9)
+    episodes = list(run_episodes([env], random_actions(env, 0), [0, 1]))
+    dataset = write_minari("tests/ram/bytes-v0", iter(episodes), env, {})
+    for read, episode in zip(dataset, episodes, strict=True):
+        for key in ("ram", "tiles", "x"):
+            np.testing.assert_array_equal(read.observations[key], [each[key] for each in episode.observations])
+
+
+def test_a_vector_of_bytes_can_be_learned_from(tmp_path: Path):
+    gym.register("tests/Ram-v0", lambda: TransformObservation(Ram(), lambda each: each["ram"], Ram.observation_space["ram"]),
+                 max_episode_steps=9)  # fmt: skip
+    try:
+        dataset = record(save_ppo("tests/Ram-v0", tmp_path / "agent.zip"), "tests/Ram-v0")
+        buffer = load_minari(dataset)
+    finally:
+        del gym.registry["tests/Ram-v0"]
+    assert buffer.observation_space.shape == (6,)
+    assert [len(episode.observations) for episode in dataset] == [16, 16, 16]
+    assert len(buffer) == 45
+
+
+class Unseeded(Countdown):
+    """Draws its starts from a generator of its own, as Meta-World does."""
+
+    generator = np.random.default_rng(0)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.left[0] = self.generator.integers(1, 41)
+        return self.left.copy(), {}
+
+
+def test_an_environment_that_does_not_start_from_its_seed_is_warned_of(countdown_agent: Path):
+    gym.register("Unseeded-v0", entry_point=Unseeded)
+    with pytest.warns(UserWarning, match="two reset.* start differently, so the recorded seeds do not replay its episodes"):
+        record(countdown_agent, "Unseeded-v0", env_kwargs=None)

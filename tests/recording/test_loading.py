@@ -139,10 +139,12 @@ def test_an_argument_that_is_no_literal_is_refused(run: Path, capsys):
     assert "'g' is no key:value" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("key", ["frame_stack", "vec_env_wrapper"])
-def test_a_run_that_vectorised_wrappers_belong_to_is_refused(key: str, run: Path, tmp_path: Path, capsys):
-    assert record(copy(run, tmp_path / "run", **{key: 4})) == 2
-    assert f"config.yml: {key} is 4; agents trained so cannot be recorded" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("key", "value"), [("frame_stack", 4), ("vec_env_wrapper", "stable_baselines3.common.vec_env.VecMonitor")]
+)
+def test_a_run_that_vectorised_wrappers_belong_to_is_refused(key: str, value: Any, run: Path, tmp_path: Path, capsys):
+    assert record(copy(run, tmp_path / "run", **{key: value})) == 2
+    assert f"config.yml: {key} is {value!r}; agents trained so cannot be recorded" in capsys.readouterr().err
 
 
 def test_a_run_that_lacks_its_statistics_is_refused(run: Path, tmp_path: Path, capsys):

@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -38,6 +39,19 @@ class SignalAt(BaseCallback):
         return True
 
 
+class SignalAtReset(gym.Wrapper):
+    """Sends this process SIGTERM at some reset, in the midst of an evaluation, where nothing has been sent before."""
+
+    n_resets = 0
+    sends_at: int | None = None
+
+    def reset(self, **kwargs):
+        type(self).n_resets += 1
+        if self.n_resets == self.sends_at:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return super().reset(**kwargs)
+
+
 def finds_tests() -> dict[str, str]:
     """An environment for processes that find the callbacks above."""
     return {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
@@ -48,7 +62,8 @@ class ResumeAt(SignalAt):
 
     def _on_step(self) -> bool:
         if self.num_timesteps == self.step:
-            subprocess.run([sys.executable, "-m", "sb3_dtfm", "train", "--resume", str(RUN)], env=finds_tests())
+            command = [sys.executable, "-m", "sb3_dtfm", "train", "--resume", str(RUN), "--gym-packages", __name__]
+            subprocess.run(command, env=finds_tests())
         return True
 
 
@@ -167,7 +182,7 @@ def test_other_arguments_beside_resume_neither_start_nor_delete_anything(workpla
     assert main(training((SIGNAL_AT, signal.SIGINT))) == 0
     files = sorted(RUN.rglob("*"))
     assert resume("-P") == 2
-    assert "takes no other arguments; it was started with --algo dtfm --env HalfCheetah-v5" in capsys.readouterr().err
+    assert "takes no other arguments but --gym-packages and --conf-file; it was" in capsys.readouterr().err
     assert sorted(RUN.rglob("*")) == files
 
 
@@ -200,3 +215,65 @@ def test_what_cannot_be_resumed_is_said(run, message, workplace, capsys):
     assert main(["train", "--resume", run]) == 2
     assert f"--resume {run}" in (error := capsys.readouterr().err)
     assert message in error
+
+
+# Two episodes each: 5 of random actions begin the run; an evaluation resets before its first episode and after each.
+@pytest.mark.parametrize(("reset", "step"), [(2, 0), (9, 0), (11, 10), (20, N_STEPS)])
+def test_a_signal_ends_an_evaluation_which_the_resumed_run_repeats(reset, step, straight, workplace, monkeypatch):
+    wrapper = f"env_wrapper:'{__name__}.SignalAtReset'"
+    monkeypatch.setattr(SignalAtReset, "n_resets", 0)
+    monkeypatch.setattr(SignalAtReset, "sends_at", reset)
+    command = training()
+    command.insert(command.index("-params") + 1, wrapper)
+    with pytest.raises(SystemExit) as ended:
+        main(command)
+    assert ended.value.code == 143
+    assert SignalAtReset.n_resets == reset
+    assert DTFM.load(RUN / CHECKPOINT).num_timesteps == step
+    assert DTFM.load(RUN / "HalfCheetah-v5.zip").num_timesteps == step
+    assert resume() == 0
+    assert_same(what_was_learned(), straight)
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-30])
+
+
+def pickle_them(path: Path) -> None:
+    np.savez(path, timesteps=np.array([0, 10]), results=np.array([None, None]), ep_lengths=np.zeros((2, 2)))
+
+
+def forget(path: Path) -> None:
+    np.savez(path, timesteps=np.array([N_STEPS]), results=np.ones((1, 2)), ep_lengths=np.ones((1, 2)))
+
+
+def confuse(path: Path) -> None:
+    np.savez(path, timesteps=np.array([0, 10]), results=np.full((3, 2), -1e9), ep_lengths=np.ones((3, 2)))
+
+
+DAMAGES = [
+    Path.unlink,
+    truncate,
+    pickle_them,
+    forget,
+    confuse,
+    lambda path: path.write_bytes(b""),
+    lambda path: path.write_text("x"),
+]
+
+
+def test_without_its_evaluations_a_run_does_not_replace_its_best_model(straight, workplace, capsys):
+    assert main(training((SIGNAL_AT, signal.SIGINT))) == 0
+    path, model = RUN / "evaluations.npz", RUN / "best_model.zip"
+    whole, best = path.read_bytes(), model.read_bytes()
+    (RUN / ".evaluations.npz").write_bytes(whole[:99])  # of a process that was killed while it wrote
+    for damage in DAMAGES:
+        path.write_bytes(whole)
+        damage(path)
+        assert main(["train", "--resume", str(RUN)]) == 2
+        error = capsys.readouterr().err.strip().splitlines()[-1]
+        assert f"{path}: expected the evaluations up to step {SIGNAL_AT + 1}" in error
+        assert model.read_bytes() == best
+    path.write_bytes(whole)
+    assert resume() == 0
+    assert_same(what_was_learned(), straight)
