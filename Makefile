@@ -1,5 +1,5 @@
 .DELETE_ON_ERROR:
-.PHONY: help install demo test test-all bench baselines lowest highest audit licences docs dist format lint type linked clean
+.PHONY: help install demo test test-all bench baselines lowest highest newest audit licences docs dist format lint type linked clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -12,11 +12,15 @@ TOOLS := .venv-tools
 # Tests of each part that meets other packages.
 SMOKE := tests/cli/test_command_line.py tests/data/test_minari.py tests/envs/robosuite/test_env.py tests/files/test_model.py \
 	tests/files/test_onnx.py
+# Some of them, without robosuite, in seconds.
+NEWEST := tests/data/test_minari.py tests/files/test_model.py \
+	tests/cli/test_command_line.py::test_train_writes_what_enjoy_reads \
+	tests/files/test_onnx.py::test_a_file_holds_a_function_for_any_number_of_rows_and_its_settings
 # What is checked and formatted besides the package.
 SOURCES := sb3_dtfm envs zoo_configs tests studies examples docs
 
 help:
-	@echo "make install  pinned environment in $(VENV), for Python 3.10 to 3.12"
+	@echo "make install  pinned environment in $(VENV), for Python 3.10 to 3.13"
 	@echo "make demo     record, train and evaluate on robosuite's Lift: 5 minutes on 2 cores"
 	@echo "make test     the fast tests"
 	@echo "make test-all the slow tests too: kills, a million calls, several processes; half an hour on 2 cores"
@@ -24,6 +28,7 @@ help:
 	@echo "make baselines    DT and DTFM beside d3rlpy's and robomimic's algorithms on studies/baselines.yml: days on one core;"
 	@echo "              ARGUMENTS=\"--data can-few --seeds 0\" runs some of it, ARGUMENTS=--help says what there is"
 	@echo "make lowest   tests of each part with the lowest versions that pyproject.toml allows; make highest: the highest"
+	@echo "make newest   tests of the package without robosuite on the newest Python here, with constraints-numpy2.txt: a minute"
 	@echo "make audit    ask for known vulnerabilities of the pinned versions; needs the network"
 	@echo "make licences write the table of docs/licences.md anew"
 	@echo "make docs     the report of results/suite.csv as docs/report.md, and the site, into build/site"
@@ -39,14 +44,14 @@ install: $(STAMP)
 # interpreter that this machine is set up for.
 $(STAMP): pyproject.toml constraints.txt
 	@set -e; python=; \
-	for candidate in $(PYTHON) python3 python3.12 python3.11 python3.10 python; do \
-		if $$candidate -c 'import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 12))' \
+	for candidate in $(PYTHON) python3 python3.13 python3.12 python3.11 python3.10 python; do \
+		if $$candidate -c 'import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' \
 				>/dev/null 2>&1; then \
 			python=$$candidate; break; \
 		fi; \
 	done; \
 	if [ -z "$$python" ]; then \
-		echo "No Python 3.10, 3.11 or 3.12 with the venv module was found; 'make install PYTHON=/path/to/python' names one." >&2; \
+		echo "No Python 3.10 to 3.13 with the venv module was found; 'make install PYTHON=/path/to/python' names one." >&2; \
 		exit 1; \
 	fi; \
 	echo "Installing into $(VENV) with $$($$python --version)"; \
@@ -57,6 +62,7 @@ $(STAMP): pyproject.toml constraints.txt
 		echo "(python3-dev) and the kernel's (linux-libc-dev). docs/howto/install.md says how to install without it." >&2; \
 		exit 1; \
 	}
+	@$(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt --no-deps robosuite  # left out on 3.13
 	@touch $@
 
 demo: install
@@ -96,6 +102,20 @@ lowest highest: install $(TOOLS)/installed
 	$(BIN)/python -m venv .venv-$@
 	$(TOOLS)/bin/uv pip install --python .venv-$@/bin/python --resolution $(RESOLUTION) -e ".[all,dev]"
 	.venv-$@/bin/python -m pytest -n 2 $(SMOKE)
+
+# pyenv's shims find all of its Pythons if all are chosen.
+newest: $(TOOLS)/installed
+	@set -e; export PYENV_VERSION=$$(pyenv versions --bare 2>/dev/null | paste -sd:); \
+	tested=$$($(BIN)/python -c 'import sys; print(sys.version_info[:2])'); \
+	for python in python3.14 python3.13 python3.12 ""; do \
+		$$python -c "import sys; sys.exit(sys.version_info[:2] <= $$tested)" >/dev/null 2>&1 && break; \
+	done; \
+	if [ -z "$$python" ]; then echo "make $@: skipped, no Python newer than that of $(VENV) is here"; exit; fi; \
+	echo "Installing into .venv-$@ with $$($$python --version)"; \
+	rm -rf .venv-$@; \
+	$(TOOLS)/bin/uv venv --quiet --python $$python .venv-$@; \
+	$(TOOLS)/bin/uv pip install --quiet --python .venv-$@ -c constraints-numpy2.txt -e ".[export,minari,mujoco,zoo]" pytest; \
+	.venv-$@/bin/python -m pytest $(NEWEST)
 
 # Strict: a package that the service does not know is an error, not a clean one.
 audit: install $(TOOLS)/installed
@@ -148,4 +168,4 @@ linked:
 	@ln -s $(CURDIR)/envs $(CURDIR)/zoo_configs build/linked/sb3_dtfm/
 
 clean:
-	rm -rf $(VENV) $(OTHERS) $(ROBOMIMIC) $(TOOLS) .venv-lowest .venv-highest build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(OTHERS) $(ROBOMIMIC) $(TOOLS) .venv-lowest .venv-highest .venv-newest build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache

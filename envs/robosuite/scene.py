@@ -4,6 +4,7 @@ import logging
 import os
 import re
 import sys
+import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -28,12 +29,13 @@ def import_robosuite() -> ModuleType:
         return sys.modules["robosuite"]
     rendering_backend = os.environ.get("MUJOCO_GL")
     try:
-        with silence(), _optional_opencv():
+        with silence(), _optional_opencv(), warnings.catch_warnings():
+            warnings.simplefilter("ignore", SyntaxWarning)  # Python 3.12 and newer warn of robosuite's logo.
             import robosuite
     except ImportError as error:
         raise ImportError(
             f"The robosuite environments need robosuite, which cannot be imported ({error}): "
-            'pip install "sb3-dtfm[robosuite]"'
+            'pip install "sb3-dtfm[robosuite]", and on Python 3.13 or newer also: pip install --no-deps "robosuite<1.6"'
         ) from error
     finally:
         if rendering_backend is None:

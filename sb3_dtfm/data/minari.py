@@ -53,6 +53,8 @@ FIELDS: dict[str, tuple[tuple[type, ...], bool]] = {
 # Seconds in which a server has to answer.
 REACHED_AFTER = 10.0
 FORMATS = ("hdf5", "arrow", "parquet")
+# Minari 0.5.3, the newest for NumPy 1 and Python 3.10, refuses files of 0.5.4, which differ only in images.
+minari.supported_dataset_versions.add("0.5.4")
 # Entries of the vector that a step's observation, or action, becomes: no task has as many.
 MOST_ENTRIES = 2**20
 

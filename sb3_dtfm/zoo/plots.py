@@ -42,7 +42,7 @@ def draw(name: str, arguments: Sequence[str]) -> list[Path]:
         try:
             commands.plot(name, others)
         except ValueError as error:
-            if name == "plot_from_file" and "empty sequence" in str(error):
+            if name == "plot_from_file" and str(error).startswith("min() "):
                 raise UsageError(ONE_RUN) from error
             raise
     return [] if folder is None else _save(name, folder)

@@ -27,6 +27,14 @@ SMALL = ["-n", "3", "--env-kwargs", "width:96", "height:64"]
 VIDEO = ["video", "--algo", "dtfm", "--env", "HalfCheetah-v5", *SMALL]
 
 
+def test_gymnasiums_own_tasks_are_drawn_with_what_the_extra_brings():
+    pytest.importorskip("pygame", reason="[classic-control] brings pygame")
+    env = gym.make("Pendulum-v1", render_mode="rgb_array")
+    env.reset(seed=0)
+    assert np.ptp(env.render()) > 200
+    env.close()
+
+
 @pytest.fixture
 def trained(workplace, monkeypatch) -> Path:
     """The folder of a run with a checkpoint, and a later one that has no model, as -optimize leaves it."""

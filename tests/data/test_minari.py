@@ -78,6 +78,14 @@ def test_every_episode_comes_back(data_format: str):
     assert "test/set-v0" in buffer.source
 
 
+@pytest.mark.parametrize("version", ["0.5.3", "0.5.4"])
+def test_files_of_either_version_are_read_by_either(version: str):
+    path = data_file(write([make_episode(5)]), "metadata.json")
+    metadata = {**json.loads(path.read_text()), "minari_version": version, "jpeg_encoding": True}
+    path.write_text(json.dumps(metadata))
+    np.testing.assert_array_equal(load_minari("test/set-v0").actions.numpy(), make_episode(5).actions)
+
+
 def test_as_many_observations_as_actions_are_accepted():
     episode = make_episode(6, extra=0)
     buffer = load_minari(write([episode]))

@@ -32,6 +32,8 @@ def wilson(n_successes: int, n_episodes: int) -> Interval:
 
     :raises ValueError: no episode, or more successes than episodes
     """
+    if not 0 <= n_successes <= n_episodes or n_episodes == 0:
+        raise ValueError(f"n_successes must be in 0 to n_episodes, which is at least 1; got {n_successes} of {n_episodes}")
     interval = stats.binomtest(n_successes, n_episodes).proportion_ci(CONFIDENCE, method="wilson")
     return Interval(n_successes / n_episodes, float(interval.low), float(interval.high))
 
