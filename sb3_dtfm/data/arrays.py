@@ -68,11 +68,15 @@ class Arrays(ABC):
         raise DatasetError(f"{self.source}: has no array {accepted}, only {found}.{cure}")
 
     def columns(self, names: Sequence[str]) -> list[str]:
-        """The columns of a table that begin with the first of the names that any begins with: `obs_0`, `obs.x`, `obs[0]`."""
+        """
+        The columns of a table that begin with the first of the names that any begins with: `obs_0`, `obs.x`, `obs[0]`; by
+        their numbers, where all have one.
+        """
         if self.are_columns and not self.has(names):
             for name in names:
                 if found := [each for each in self.names if re.match(rf"{name}[\W_\d]", each)]:
-                    return found
+                    numbers = [re.search(r"(\d+)\W*$", each) for each in found]
+                    return found if None in numbers else sorted(found, key=lambda each: int(re.findall(r"\d+", each)[-1]))
         return [self.name(names)]
 
     def stored(self, name: str) -> Any:
@@ -179,8 +183,9 @@ class _Table(Arrays):
     are_columns = True
 
     def __init__(self, table: Any, source: str, n_stored: int | None = None) -> None:
-        super().__init__(source, [str(name) for name in table], n_stored)
-        self._columns = {str(name): table[name] for name in table}
+        names = getattr(table, "columns", table)
+        super().__init__(source, [str(name) for name in names], n_stored)
+        self._columns = {str(name): table[name] for name in names}
 
     def _get(self, name: str, where: str) -> Any:
         column = self._columns[name]

@@ -150,8 +150,9 @@ def load_dataset(
     Read recorded episodes from wherever they are.
 
     :param dataset: a Minari id (`namespace/name-vN`), an opened Minari dataset, the path of a robomimic hdf5 file; flat
-        arrays, as the path of an `.npz` or of D4RL's hdf5, or a dictionary, see :func:`load_flat`; the folder of a LeRobot
-        dataset, see :func:`load_lerobot`; a list of episodes, see :func:`load_episodes`; an SB3 replay buffer, see
+        arrays, as the path of an `.npz` or of D4RL's hdf5, or a dictionary, see :func:`load_flat`; a table, as the path of a
+        `.csv` or `.parquet` or a DataFrame, see there too; the folder of a LeRobot dataset, see :func:`load_lerobot`; a list
+        of episodes, see :func:`load_episodes`, or of steps, see :func:`load_steps`; an SB3 replay buffer, see
         :func:`load_replay_buffer`; a list of several datasets, see :func:`load_several`; a buffer
     :param cache_dir: learn from memory-mapped files in this folder, for datasets larger than memory; they are written at
         the first call and whenever the dataset has changed. None reads everything into memory
@@ -170,8 +171,8 @@ def load_dataset(
     :param allow_pickle: read pickles, which can run code: files of SB3's replay buffers (`.pkl`), and arrays of objects in
         `.npz`; not accepted from `dataset_kwargs`, which files of others may hold
     :param kwargs: options of the reader: `on_invalid`, which is "raise" unless "drop" leaves episodes out that would be
-        refused, with a warning that names their number and the first reason; `filter_key` and `observation_keys` for
-        robomimic files, see also :func:`load_flat`
+        refused, with a warning that names their number and the first reason; `observation_keys` and `clip_actions`;
+        `filter_key` for robomimic files and `episodes` for LeRobot datasets, see also :func:`load_flat`
     :raises DatasetError: `dataset` is nothing of the above, its reader refuses it, or its cache cannot be used
     :raises TypeError: the reader has no such option
     """

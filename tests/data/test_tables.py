@@ -79,6 +79,15 @@ def test_columns_of_vectors(tmp_path):
         assert (buffer.observation_space.shape, buffer.terminated.tolist()) == ((2,), [True, True])
 
 
+def test_numbered_columns_come_by_their_numbers(write):
+    """As text, 10 comes before 2."""
+    rest = {name: COLUMNS[name] for name in ("episode", "action", "reward")}
+    numbered = {f"obs[{number}]": [float(number)] * 5 for number in (10, 2, 0)}
+    assert load_dataset(write({**numbered, **rest})).observations[0].tolist() == [0, 2, 10]
+    named = {f"state.{name}": [float(number)] * 5 for number, name in enumerate(("speed", "angle_2"))}
+    assert load_dataset(write({**named, **rest})).observations[0].tolist() == [0, 1]
+
+
 def test_steps_of_an_episode_lie_side_by_side(write):
     with pytest.raises(DatasetError, match=r"episode a comes in several places; .* as after a stable sort"):
         load_dataset(write({**COLUMNS, "episode": list("ababa")}))
