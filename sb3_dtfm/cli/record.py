@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from sb3_dtfm.cli.literals import key_value
 
 EPILOG = """\
-An agent's files are pickles, and so are VecNormalize's statistics. Name those that you trust. A run's statistics, environment
-arguments and wrappers are found whether its folder is named or a zip in it.
+An agent's files are pickles, and so are VecNormalize's statistics. Name those that you trust. A run's statistics,
+environment arguments and wrappers are found whether its folder is named or a zip in it.
 
 examples:
   sb3-dtfm record --algo tqc --model agent.zip --env HalfCheetah-v5 --episodes 100 --dataset-id local/halfcheetah/expert-v0
