@@ -208,3 +208,8 @@ def test_random_cheetah_fits_its_env(cheetah_buffer):
     model = make_model(DT, buffer)
     model.set_env(make_env())
     assert model.get_env() is not None
+
+
+def test_an_environment_of_gymnasiums_own_vectors_is_refused(cheetah_buffer):
+    with pytest.raises(ValueError, match=r"env is a SyncVectorEnv: write make_vec_env\(env_id, n_envs\)"):
+        DTFM("MultiInputPolicy", gym.make_vec("HalfCheetah-v5", num_envs=2), cheetah_buffer)

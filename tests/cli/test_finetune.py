@@ -271,7 +271,8 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
     cases = {
         "--model nowhere": "nowhere does not exist; --model names a DTFM's zip file or its run's folder.",
         "--model logs/dt/HalfCheetah-v5_1": "was saved by DT, not by DTFM.",
-        "--model alone.zip": "--target-return: needed, as alone.zip does not tell what return was asked for.",
+        "--model alone.zip": "--target-return R: needed, as alone.zip does not tell what return was asked for; "
+        "`sb3-dtfm inspect DATASET` suggests one.",
         f"--model {run} --algo td3": "--algo td3: no packaged settings; those of dtfm, ppo, sac, tqc are.",
         "--model alone.zip --algo dtfm --target-return 3": "dataset:...: needed, as alone.zip does not tell what it learned",
         f"--model {run} --algo dtfm -params n_episods:3": "n_episods (did you mean n_episodes?): no hyperparameter of",
