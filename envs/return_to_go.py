@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Mapping
 from typing import Any, NamedTuple, SupportsFloat
 
 import gymnasium as gym
@@ -11,7 +12,14 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.env_util import unwrap_wrapper
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, is_vecenv_wrapped, unwrap_vec_normalize
+from stable_baselines3.common.preprocessing import is_image_space_channels_first
+from stable_baselines3.common.vec_env import (
+    VecEnv,
+    VecFrameStack,
+    VecTransposeImage,
+    is_vecenv_wrapped,
+    unwrap_vec_normalize,
+)
 
 from sb3_dtfm.envs.robotics import warn_of_reward
 from sb3_dtfm.envs.success import reported_success
@@ -19,8 +27,42 @@ from sb3_dtfm.envs.success import reported_success
 OBSERVATION = "observation"
 RETURN_TO_GO = "return_to_go"
 TIMESTEP = "timestep"
+# The camera of an environment that observes nothing but an image.
+IMAGE = "image"
 # In `info` after several actions: what was observed between them.
 BETWEEN = "observations_between"
+
+
+def image_spaces(space: spaces.Space) -> dict[str, spaces.Box]:
+    """
+    The images that an environment shows, by camera.
+
+    :param space: its observation space: an image itself, which is called `image`, or a Dict of images and others
+    :return: Box of uint8, as the environment has them
+    """
+    parts = space.spaces if isinstance(space, spaces.Dict) else {IMAGE: space}
+    return {str(key): part for key, part in parts.items() if isinstance(part, spaces.Box) and _is_image(part)}
+
+
+def _is_image(space: spaces.Box) -> bool:
+    return space.dtype == np.uint8 and len(space.shape) == 3
+
+
+def channels_first(space: spaces.Box) -> spaces.Box:
+    """The space of images as a network takes them, (channels, height, width)."""
+    return space if is_image_space_channels_first(space) else VecTransposeImage.transpose_space(space)
+
+
+def without_images(space: spaces.Space) -> spaces.Space:
+    """The space of what is no image; of images alone, a number that is always 0."""
+    if not image_spaces(space):
+        return space
+    others = (
+        {key: part for key, part in space.spaces.items() if key not in image_spaces(space)}
+        if isinstance(space, spaces.Dict)
+        else {}
+    )
+    return spaces.Dict(others) if others else spaces.Box(0.0, 0.0, (1,), np.float32)
 
 
 def sort_observation_space(space: spaces.Space) -> spaces.Space:
@@ -37,7 +79,10 @@ def sort_observation_space(space: spaces.Space) -> spaces.Space:
     if isinstance(space, spaces.Tuple) and len(space) > 0:
         return spaces.Tuple([sort_observation_space(part) for part in space.spaces])
     if isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) > 1:
-        raise ValueError(f"Observation space {space} holds an image; only vectors of numbers can be used.")
+        raise ValueError(
+            f"Observation space {space} is no image that can be used: height, width and channels of uint8 are expected, "
+            "as a space of its own or as an entry of the Dict that the environment observes."
+        )
     if not isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
         raise ValueError(
             f"Observation space {space} cannot be flattened to a Box; "
@@ -60,20 +105,25 @@ def flatten_observation_space(space: spaces.Space) -> spaces.Box:
         return spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
 
 
-def return_to_go_space(observation_space: spaces.Space) -> spaces.Dict:
+def return_to_go_space(observation_space: spaces.Space, images: Mapping[str, spaces.Box] | None = None) -> spaces.Dict:
     """
     What a sequence policy observes, for an environment or for a dataset.
 
     :param observation_space: of the bare environment, or the flat one of a dataset's buffer
-    :return: Dict of `observation` (O,) float32, `return_to_go` (1,) float32, `timestep` (1,) int64
+    :param images: of a dataset's buffer; those in `observation_space` by default
+    :return: Dict of `observation` (O,) float32, `return_to_go` (1,) float32, `timestep` (1,) int64, and images by camera
     :raises ValueError: `observation_space` cannot be flattened
     """
+    images = image_spaces(observation_space) if images is None else images
+    if taken := {OBSERVATION, RETURN_TO_GO, TIMESTEP} & images.keys():
+        raise ValueError(f"An image is called {', '.join(taken)}, as what ReturnToGoWrapper shows; give it another name.")
     return spaces.Dict(
         {
-            OBSERVATION: flatten_observation_space(observation_space),
+            OBSERVATION: flatten_observation_space(without_images(observation_space)),
             RETURN_TO_GO: spaces.Box(-np.inf, np.inf, (1,), np.float32),
             # Box.sample adds one to the bound, which overflows at the largest int64.
             TIMESTEP: spaces.Box(0, np.iinfo(np.int32).max, (1,), np.int64),
+            **images,
         }
     )
 
@@ -112,7 +162,8 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     The return-to-go starts at the target and loses each reward: g(0) = target, g(t+1) = g(t) - r(t). It is counted in
     float64 and shown as float32, in environment reward units; scaling is the policy's business. A Dict observation
-    (goal-conditioned tasks, for example) is flattened to one vector, see :func:`flatten_observation_space`.
+    (goal-conditioned tasks, for example) is flattened to one vector, see :func:`flatten_observation_space`; its images stay
+    as they are, each by its key.
 
     An episode that is ahead of its target keeps the target's pace: in an environment with a time limit of T steps it is
     shown at least target (1 - t / T). Otherwise a policy that leaves out its recordings' noise, and so returns more, is
@@ -142,7 +193,8 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.target_return = None if target_return is None else check_target_return(target_return)
         self.observation_space = return_to_go_space(env.observation_space)
         self._monitor: Any = unwrap_wrapper(env, Monitor)
-        self._sorted_space = sort_observation_space(env.observation_space)
+        self._cameras = list(image_spaces(env.observation_space))
+        self._vector_space = sort_observation_space(without_images(env.observation_space))
         self._episode_target = self._return_to_go = math.nan
         self._timestep = 0
 
@@ -154,7 +206,7 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     @property
     def recorded_space(self) -> spaces.Space:
         """What the environment itself observes, with sorted keys."""
-        return self._sorted_space
+        return self.env.observation_space if self._cameras else self._vector_space
 
     def set_target_return(self, target_return: float) -> None:
         """
@@ -213,8 +265,15 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return_to_go = self._return_to_go
         if self._time_limit is not None:
             return_to_go = max(return_to_go, self._episode_target * (1.0 - self._timestep / self._time_limit))
+        images: dict[str, np.ndarray] = {}
+        if self._cameras and isinstance(self.env.observation_space, spaces.Dict):
+            images = {camera: observation[camera] for camera in self._cameras}
+            observation = {key: part for key, part in observation.items() if key not in images} or np.zeros(1, np.float32)
+        elif self._cameras:
+            images, observation = {IMAGE: observation}, np.zeros(1, np.float32)
         return {
-            OBSERVATION: np.asarray(spaces.flatten(self._sorted_space, observation)).astype(np.float32),
+            **images,
+            OBSERVATION: np.asarray(spaces.flatten(self._vector_space, observation)).astype(np.float32),
             RETURN_TO_GO: np.array([return_to_go], dtype=np.float32),
             TIMESTEP: np.array([self._timestep], dtype=np.int64),
         }
@@ -241,7 +300,7 @@ def check_vec_env(
         )
     if is_vecenv_wrapped(env, VecFrameStack):
         raise ValueError("VecFrameStack would mix up return_to_go and timestep; set context_length instead.")
-    if set(getattr(env.observation_space, "spaces", {})) != {OBSERVATION, RETURN_TO_GO, TIMESTEP}:
+    if not {OBSERVATION, RETURN_TO_GO, TIMESTEP} <= set(getattr(env.observation_space, "spaces", {})):
         raise ValueError(
             f"{name} must be wrapped in sb3_dtfm.envs.ReturnToGoWrapper, inside any vectorised environment: write {remedy}. "
             f"Its observation space is {env.observation_space}."

@@ -7,7 +7,7 @@ import math
 import numbers
 import re
 from collections.abc import Collection, Iterable, Mapping
-from typing import Any, NamedTuple, TypeAlias, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -71,7 +71,13 @@ class Choice(NamedTuple):
         return f"one of {', '.join(map(str, self.values))}"
 
 
-Rule: TypeAlias = Number | Choice
+class Rule(Protocol):
+    """The accepted values of an argument, as a message says them."""
+
+    def accepts(self, value: Any) -> bool:
+        """Whether a value is one of them."""
+        ...
+
 
 BOOLEAN = Choice((True, False))
 COUNT = Number(low=1, whole=True)

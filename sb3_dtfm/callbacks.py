@@ -272,13 +272,13 @@ def draw_flow(policy: Any, window: Any, seed: int = 0) -> "Figure":
     from matplotlib.figure import Figure
 
     head = policy.acting_network.head
-    if not hasattr(head, "paths") or head.noise_dim != 2:
+    if not hasattr(head, "solve") or head.noise_dim != 2:
         found = f"the head is a {type(head).__name__} that starts from {head.noise_dim} numbers of noise"
         raise ValueError(f"Only a flow of two numbers can be drawn; {found}.")
     with th.no_grad():
         hidden = policy.newest_hidden(window)
         noise = th.randn(N_PATHS, 2, generator=th.Generator().manual_seed(seed)).to(hidden.device)
-        paths = head.paths(hidden.expand(N_PATHS, -1), noise).cpu()
+        paths = flow_paths(head, hidden.expand(N_PATHS, -1), noise).cpu()
     figure = Figure(figsize=(4.4, 4.4), layout="constrained")
     axis = figure.subplots()
     axis.plot(*paths.permute(2, 0, 1), color="0.8", linewidth=0.6)
@@ -289,3 +289,19 @@ def draw_flow(policy: Any, window: Any, seed: int = 0) -> "Figure":
     axis.legend(frameon=False, fontsize="small", loc="upper right")
     axis.spines[["top", "right"]].set_visible(False)
     return figure
+
+
+def flow_paths(head: Any, hidden: th.Tensor, noise: th.Tensor, n_points: int = 50) -> th.Tensor:
+    """
+    What lies between noise and actions.
+
+    :param head: a flow's
+    :param hidden: (..., D)
+    :param noise: (..., A), standard normal
+    :param n_points: N, at equal distances in time, by as many Euler steps
+    :return: (N + 1, ..., A), the noise first, the actions last
+    """
+    points: list[th.Tensor] = []
+    with head.vector_field.register_forward_pre_hook(lambda _, inputs: points.append(inputs[0])):
+        end = head.solve(hidden, noise, "euler", n_points)
+    return th.stack([*points, end])

@@ -114,7 +114,7 @@ class DataParallel:
         """
         if self.n_processes == 1:
             return self._compute_loss(batch, *noise)
-        share = Windows(**{name: tensor[self._rows] for name, tensor in batch._asdict().items()})
+        share = batch.map(lambda tensor: tensor[self._rows])
         loss, parts = self._policy_loss(share, *(tensor[self._rows] for tensor in noise))
         weight = self._weight(batch.mask)
         loss, weighted = weight * loss, {name: weight * part for name, part in parts.items()}

@@ -1,6 +1,10 @@
 """Windows of K consecutive steps: what a network learns from, and acts on."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
+
+# The vector among the observations, where these hold images too.
+OBSERVATION = "observation"
 
 
 class Windows(NamedTuple):
@@ -19,19 +23,11 @@ class Windows(NamedTuple):
     timesteps: Any
     mask: Any
 
+    def map(self, change: Callable[[Any], Any]) -> "Windows":
+        """Windows of changed tensors, those of images too."""
+        return Windows(*(map_tensors(change, each) for each in self))
 
-class Transitions(NamedTuple):
-    """
-    B steps and where they led to; of a chunk, h steps as one.
 
-    Shapes: observations (B, O); actions (B, h A), one after the other; rewards (B,), discounted sums over the h steps, in
-    environment reward units; next_observations (B, O); discounts (B,), what the value of the next observation counts, 0
-    where the episode has terminated; mask (B,) bool, False where the recording ended before it could be told.
-    """
-
-    observations: Any
-    actions: Any
-    rewards: Any
-    next_observations: Any
-    discounts: Any
-    mask: Any
+def map_tensors(change: Callable[[Any], Any], tensors: Any) -> Any:
+    """A changed tensor, or a dictionary of changed tensors."""
+    return {name: change(each) for name, each in tensors.items()} if isinstance(tensors, dict) else change(tensors)

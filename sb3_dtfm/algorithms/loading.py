@@ -24,7 +24,7 @@ from sb3_dtfm.algorithms.saving import (
 )
 from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, Choice, Number, Rule, check_arguments
 from sb3_dtfm.data import ReturnReference, check_action_space
-from sb3_dtfm.envs import OBSERVATION, RETURN_TO_GO, TIMESTEP
+from sb3_dtfm.envs import OBSERVATION, RETURN_TO_GO, TIMESTEP, image_spaces
 from sb3_dtfm.files import ModelFileError, file_name, read_model
 from sb3_dtfm.optimization import RunningMeans
 from sb3_dtfm.policies import SequencePolicy
@@ -181,8 +181,9 @@ def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
         check_arguments(attributes, {name: rule for name, rule in SAVED.items() if name in attributes})
     observation, action = attributes["observation_space"], attributes["action_space"]
     parts = observation.spaces if isinstance(observation, spaces.Dict) else {}
-    is_vector = {name: isinstance(part, spaces.Box) and len(part.shape) == 1 for name, part in parts.items()}
-    if is_vector != dict.fromkeys((OBSERVATION, RETURN_TO_GO, TIMESTEP), True):
+    shapes = {name: part.shape for name, part in parts.items() if isinstance(part, spaces.Box)}
+    vectors = {name for name in shapes if len(shapes[name]) == 1}
+    if vectors != {OBSERVATION, RETURN_TO_GO, TIMESTEP} or len(parts) != len(vectors) + len(image_spaces(observation)):
         raise ModelFileError(f"{source}: observation_space is {observation}, not what a ReturnToGoWrapper observes.")
     with wrap_file_errors(source):
         check_action_space(action, "action_space")

@@ -24,14 +24,14 @@ from sb3_dtfm.algorithms.saving import OPTIMIZER, POLICY, optimizer_tensors, opt
 from sb3_dtfm.arguments import NOT_NEGATIVE, Rule, documented_parameters
 from sb3_dtfm.data import DatasetError, ReturnReference, ScoreReference, TrajectoryBuffer, check_action_space
 from sb3_dtfm.distributed import is_first_process
-from sb3_dtfm.envs import ReturnToGoWrapper, check_vec_env, known_task, share_target_return
+from sb3_dtfm.envs import ReturnToGoWrapper, check_vec_env, image_spaces, known_task, share_target_return
 from sb3_dtfm.files import ModelFile, ModelFileError, file_name, holds_pickles, read_model, write_model, write_onnx
 from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.policies.exported import ExportedPolicy
 from sb3_dtfm.policies.options import PolicyOptions
 
-# The names of an algorithm's one policy: Stable-Baselines3's for dictionaries, which is what it observes, and for vectors.
-POLICY_NAMES = ("MultiInputPolicy", "MlpPolicy")
+# The names of an algorithm's one policy: Stable-Baselines3's for dictionaries, which it observes, for vectors and images.
+POLICY_NAMES = ("MultiInputPolicy", "MlpPolicy", "CnnPolicy")
 
 SelfModel = TypeVar("SelfModel", bound="SequenceModel")
 
@@ -175,6 +175,12 @@ class SequenceModel(BaseAlgorithm):
         ours, theirs = self.observation_space["observation"], observation_space["observation"]  # type: ignore[index]
         if ours.shape != theirs.shape:
             raise DatasetError(f"{found} observations of {theirs}, {expected} {ours}.")
+        own, others = (
+            {camera: image.shape for camera, image in image_spaces(space).items()}
+            for space in (self.observation_space, observation_space)
+        )
+        if own != others:
+            raise DatasetError(f"{found} images {others or 'of no camera'}, {expected} {own or 'of no camera'}.")
         if not same_actions(self.action_space, action_space):
             raise DatasetError(f"{found} actions of {action_space}, {expected} {self.action_space}.")
 

@@ -45,7 +45,7 @@ from sb3_dtfm.distributed import (
     local_rank_zero_first,
     n_processes,
 )
-from sb3_dtfm.envs import check_vec_env, known_task, recorded_space, return_to_go_space, share_target_return
+from sb3_dtfm.envs import channels_first, check_vec_env, known_task, recorded_space, return_to_go_space, share_target_return
 from sb3_dtfm.optimization import (
     BATCHES,
     DROPOUT,
@@ -65,7 +65,8 @@ from sb3_dtfm.optimization import (
     step_seed,
 )
 from sb3_dtfm.policies import SequencePolicy
-from sb3_dtfm.windows import Transitions, Windows
+from sb3_dtfm.transitions import ENDS, Transitions
+from sb3_dtfm.windows import Windows
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineAlgorithm")
 
@@ -268,7 +269,8 @@ class OfflineAlgorithm(SequenceModel):
         known["observation_space"] = None if self.env is None else recorded_space(self.env)
         with local_rank_zero_first():
             buffer = load_dataset(self.dataset, **{**known, **without_pickles(self.dataset_kwargs)})
-        observation_space = return_to_go_space(buffer.observation_space)
+        images = {camera: channels_first(space) for camera, space in buffer.image_spaces.items()}
+        observation_space = return_to_go_space(buffer.observation_space, images)
         if getattr(self, "observation_space", None) is None:
             self.observation_space, self.action_space, self.n_envs = observation_space, buffer.action_space, 1
         self._check_spaces(observation_space, buffer.action_space, f"{buffer.source} holds", "the environment's are")
@@ -448,7 +450,8 @@ class OfflineAlgorithm(SequenceModel):
         :param noise: what the network's `draw_noise` gave for the batch
         :return: the loss to minimise, and its parts by their logged names
         """
-        return self.policy.network.loss(self.policy.normalization.scale_batch(batch), *noise)
+        seen = batch._replace(observations=self.policy.network.see(batch.observations))
+        return self.policy.network.loss(self.policy.normalization.scale_batch(seen), *noise)
 
     def _chosen_precision(self) -> str:
         """ "float32" or "bfloat16": what was asked for, or what "auto" is here."""
@@ -493,7 +496,9 @@ class OfflineAlgorithm(SequenceModel):
         sums: dict[str, th.Tensor] = {}
         for _ in range(n_steps):
             batch = self._sample_transitions(critic.batch_size, generator)
-            parts = critic.learn(self.policy.normalization.scale_transitions(batch))
+            with th.no_grad():
+                ends = {name: self.policy.network.see(getattr(batch, name)) for name in ENDS}
+            parts = critic.learn(self.policy.normalization.scale_transitions(batch._replace(**ends)))
             sums = {name: sums.get(name, 0.0) + part for name, part in parts.items()}
         return {name: total / n_steps for name, total in sums.items()}
 

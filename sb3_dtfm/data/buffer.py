@@ -3,7 +3,7 @@
 import copy
 import os
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +18,16 @@ from sb3_dtfm.data.drawing import FlatSteps
 from sb3_dtfm.data.episodes import EpisodeTable, Statistics, moments
 from sb3_dtfm.data.expected import Steps, expected_returns_to_go
 from sb3_dtfm.data.short_episodes import ShortEpisodes
-from sb3_dtfm.data.storage import STEP_ARRAYS, FileStorage, MappedSteps, MemoryStorage
-from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, returns_to_go
+from sb3_dtfm.data.storage import FileStorage, MappedSteps, MemoryStorage
+from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, listed, returns_to_go
 from sb3_dtfm.files import replacing
-from sb3_dtfm.windows import Transitions
+from sb3_dtfm.transitions import Transitions
+from sb3_dtfm.windows import OBSERVATION, map_tensors
+
+# A buffer moves to an accelerator if it takes at most this share of the memory that is free there.
+DEVICE_MEMORY_SHARE = 0.5
+# How the names of image arrays in a file of flat arrays begin.
+IMAGE = "image:"
 
 
 def with_npz(path: str | os.PathLike[str]) -> Path:
@@ -43,6 +49,7 @@ class TrajectoryBuffer(FlatSteps):
         :func:`~sb3_dtfm.actions.to_vectors`
     :ivar rewards: (N,) float32, environment reward units
     :ivar returns_to_go: (N,) float32, environment reward units
+    :ivar image_spaces: of the images, uint8 as they were recorded, by camera; the images themselves are `own(camera)`
     :ivar episodes: the buffer's episodes, one row each
     :ivar weights: (E,) float64, how often a step of each is drawn beside one of weight 1
     :ivar env_id: Gymnasium id of the environment that they come from, None where nobody says
@@ -61,8 +68,10 @@ class TrajectoryBuffer(FlatSteps):
         env_id: str | None = None,
         maps: Sequence[MappedSteps] = (),
         dropped: tuple[int, str] | None = None,
+        image_spaces: Mapping[str, spaces.Box] | None = None,
     ) -> None:
         super().__init__(tensors, episodes, maps)
+        self.image_spaces = dict(image_spaces or {})
         self.observation_space = observation_space
         self.action_space = action_space
         self.source = source
@@ -108,10 +117,11 @@ class TrajectoryBuffer(FlatSteps):
         :raises DatasetError: nothing to learn from, other spaces, wrong shapes, NaN or infinity, or actions outside of
             `action_space`
         """
-        tensors, episodes, observation_space, dropped = collect(
+        tensors, episodes, observation_space, image_spaces, dropped = collect(
             trajectories, action_space, observation_space, n_steps, source, storage or MemoryStorage(), on_invalid, n_stored
         )
-        return cls(tensors, episodes, observation_space, action_space, source, score_reference, env_id, dropped=dropped)
+        about = (source, score_reference, env_id)
+        return cls(tensors, episodes, observation_space, action_space, *about, dropped=dropped, image_spaces=image_spaces)
 
     def __repr__(self) -> str:
         return f"TrajectoryBuffer({self.source}: {self.n_episodes} episodes, {len(self)} steps)"
@@ -293,7 +303,31 @@ class TrajectoryBuffer(FlatSteps):
             discounts=gamma**n_steps * goes_on,
             mask=goes_on | terminated,
         )
-        return Transitions(*(tensor.to(self.device) for tensor in batch))
+        if self.cameras:
+            next_rows = rows + th.minimum(steps[-1] + 1, n_left)
+            batch = batch._replace(
+                observations={OBSERVATION: batch.observations, **self.images(rows, rows.shape)},
+                next_observations={OBSERVATION: batch.next_observations, **self.images(next_rows, rows.shape)},
+            )
+        return Transitions(*(map_tensors(lambda tensor: tensor.to(self.device), each) for each in batch))
+
+    def to(self, device: th.device | str) -> "TrajectoryBuffer":
+        """
+        The same buffer for batches on a device.
+
+        Its tensors move there if they take at most half of the memory that is free; otherwise each batch moves.
+        """
+        moved = copy.copy(self)
+        moved.device = th.device(device)
+        if moved.device.type == "cuda":
+            free, _ = th.cuda.mem_get_info(moved.device)
+            if sum(tensor.nbytes for tensor in self.stored.values()) > DEVICE_MEMORY_SHARE * free:
+                return moved
+        moved.stored = {name: tensor.to(moved.device) for name, tensor in self.stored.items()}
+        moved.device = moved.stored["observations"].device
+        moved._maps = self._maps if moved.device.type == "cpu" else ()
+        moved._set_episodes(self.episodes)
+        return moved
 
     def check_task(self, env_id: str) -> None:
         """
@@ -370,21 +404,23 @@ class TrajectoryBuffer(FlatSteps):
         first, source = buffers[0], " + ".join(buffer.source for buffer in buffers)
         for other in buffers[1:]:
             sizes = other.observation_space.shape == first.observation_space.shape
-            if not sizes or not same_actions(other.action_space, first.action_space):
+            cameras = other.image_spaces == first.image_spaces
+            if not sizes or not cameras or not same_actions(other.action_space, first.action_space):
                 held = [
-                    f"{each.source} holds {each.observation_space.shape}, {each.action_space}" for each in (first, other)
+                    f"{each.source} holds {each.observation_space.shape}, {each.action_space}, images of "
+                    f"{listed(each.image_spaces)}"
+                    for each in (first, other)
                 ]
                 raise DatasetError(f"{source}: other observations or actions cannot be joined: {'; '.join(held)}.")
         named = next((buffer for buffer in buffers if buffer.env_id is not None), first)
         for other in buffers:
             if other.env_id is not None:
                 named.check_task(other.env_id)
-        tensors = {
-            name: th.cat([getattr(each, name).to(first.stored[name].device) for each in buffers]) for name in STEP_ARRAYS
-        }
+        tensors = {name: th.cat([each.own(name).to(first.stored[name].device) for each in buffers]) for name in first.stored}
         table = EpisodeTable(*map(np.concatenate, zip(*(each.episodes for each in buffers), strict=True)))
         table = table._replace(starts=np.cumsum(table.lengths) - table.lengths)
-        joined = cls(tensors, table, first.observation_space, first.action_space, source, env_id=named.env_id)
+        about = (first.observation_space, first.action_space, source)
+        joined = cls(tensors, table, *about, env_id=named.env_id, image_spaces=first.image_spaces)
         if len({buffer.score_reference for buffer in buffers}) == 1:
             joined.score_reference = first.score_reference
         if dropped := [buffer.dropped for buffer in buffers if buffer.dropped]:
@@ -422,6 +458,7 @@ class TrajectoryBuffer(FlatSteps):
         ended = {name: np.zeros(len(self), bool) for name in ("terminations", "truncations")}
         ended["terminations"][stops - 1], ended["truncations"][stops - 1] = self.terminated, self.truncated
         steps = {name: getattr(self, name).cpu().numpy() for name in ("observations", "actions", "rewards")}
+        steps |= {f"{IMAGE}{camera}": self.own(camera).cpu().numpy() for camera in self.image_spaces}
         steps["actions"] = from_vectors(steps["actions"], self.action_space)
         space = dict(zip(("action_low", "action_high"), bounds_of(self.action_space), strict=True))
         named = {} if self.env_id is None else {"env_id": np.array(self.env_id)}

@@ -25,7 +25,7 @@ from sb3_dtfm.data.storage import STEP_ARRAYS, WRITE_BUFFER, FileStorage, Mapped
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference
 
 # Counts up whenever what is stored, or what the readers make of a dataset, changes: older caches are then built anew.
-FORMAT = 6
+FORMAT = 7
 DESCRIPTION = "cache.json"
 EPISODES = "episodes.npz"
 SPACES = ("observation_space", "action_space")
@@ -173,6 +173,7 @@ def _build(folder: Path, fingerprint: Fingerprint, read: Callable[[FileStorage],
             "env_id": buffer.env_id,
             "score_reference": buffer.score_reference,
             "n_steps": len(buffer),
+            "images": {camera: list(space.shape) for camera, space in buffer.image_spaces.items()},
             "dropped": buffer.dropped,
             "digests": {file.name: _file_digest(file) for file in sorted(part.iterdir())},
         }
@@ -233,7 +234,9 @@ def open_cache(folder: Path) -> TrajectoryBuffer:
     }
     n_steps = int(description["n_steps"])
     reference = description["score_reference"]
-    maps = {name: _checked_map(folder, name, (n_steps, *shapes.get(name, ()))) for name in STEP_ARRAYS}
+    images = {camera: spaces.Box(0, 255, shape, np.uint8) for camera, shape in description["images"].items()}
+    shapes |= {camera: space.shape for camera, space in images.items()}
+    maps = {name: _checked_map(folder, name, (n_steps, *shapes.get(name, ()))) for name in (*STEP_ARRAYS, *images)}
     for steps in maps.values():
         steps.check = check
     return TrajectoryBuffer(
@@ -246,6 +249,7 @@ def open_cache(folder: Path) -> TrajectoryBuffer:
         description["env_id"],
         maps=[steps for name, steps in maps.items() if name != "rewards"],  # which windows do not hold
         dropped=description["dropped"],
+        image_spaces=images,
     )
 
 
@@ -314,7 +318,8 @@ def _checked_map(folder: Path, name: str, shape: tuple[int, ...]) -> MappedSteps
         steps = MappedSteps(folder, name)
     except READ_ERRORS as error:
         raise _damaged(folder, f"{name}.npy", error) from error
-    if steps.tensor.dtype != th.float32 or steps.tensor.shape != shape:
-        found = f"{steps.tensor.dtype} of shape {tuple(steps.tensor.shape)}, expected torch.float32 of shape {shape}"
+    dtype = th.float32 if name in STEP_ARRAYS else th.uint8
+    if steps.tensor.dtype != dtype or steps.tensor.shape != shape:
+        found = f"{steps.tensor.dtype} of shape {tuple(steps.tensor.shape)}, expected {dtype} of shape {shape}"
         raise _damaged(folder, f"{name}.npy", found)
     return steps

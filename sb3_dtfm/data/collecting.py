@@ -35,12 +35,13 @@ def collect(
     storage: MemoryStorage | FileStorage,
     on_invalid: str,
     n_stored: int | None,
-) -> tuple[dict[str, th.Tensor], EpisodeTable, spaces.Box, tuple[int, str] | None]:
+) -> tuple[dict[str, th.Tensor], EpisodeTable, spaces.Box, dict[str, spaces.Box], tuple[int, str] | None]:
     """
     Arguments are those of :meth:`TrajectoryBuffer.from_trajectories`.
 
     :param trajectories: or short episodes, many together
-    :return: the flat tensors, a row for each episode, the observation space, and what the buffer tells of dropped episodes
+    :return: the flat tensors, a row for each episode, the observation space, those of images by camera, and what the buffer
+        tells of dropped episodes
     :raises DatasetError: as there
     """
     if on_invalid not in ON_INVALID:
@@ -52,17 +53,21 @@ def collect(
     storage.reserve(n_steps or 0)
     tables: list[EpisodeTable] = []
     dropped: list[DatasetError] = []
+    image_spaces: dict[str, spaces.Box] | None = None
     start = 0
 
     def check(episodes: Trajectory | ShortEpisodes) -> tuple[EpisodeTable, np.ndarray]:
-        nonlocal observation_space
+        nonlocal observation_space, image_spaces
         trajectory = episodes.steps if isinstance(episodes, ShortEpisodes) else episodes
         space = observation_space or spaces.Box(-np.inf, np.inf, np.shape(trajectory.observations)[1:], np.float32)
-        to_go = check_trajectory(trajectory, space, action_space, source)
+        to_go = check_trajectory(trajectory, space, action_space, source, image_spaces)
         if n_stored is not None:
             n_rows, n_columns = max(n_steps or 0, start + len(trajectory)), space.shape[0] + n_action_numbers + 2
             check_size(4 * n_rows * n_columns, n_stored, f"{source}: {n_rows} steps")
         observation_space = space
+        if image_spaces is None:
+            shapes = {camera: array.shape[1:] for camera, array in trajectory.images.items()}
+            image_spaces = {camera: spaces.Box(0, 255, shape, np.uint8) for camera, shape in shapes.items()}
         if isinstance(episodes, Trajectory):
             return _table_of_one(episodes, start, to_go), to_go
         table, to_go = episodes.table(start)
@@ -77,6 +82,7 @@ def collect(
                 "actions": to_vectors(steps.actions, action_space),
                 "rewards": steps.rewards,
                 "returns_to_go": to_go,
+                **steps.images,
             }
         )
         tables.append(table)
@@ -86,7 +92,7 @@ def collect(
         raise DatasetError(f"{source}: holds no episode{left}; at least one is needed.")
     tensors = storage.finish()
     table = EpisodeTable(*map(np.concatenate, zip(*tables, strict=True)))
-    return tensors, table, observation_space, (len(dropped), str(dropped[0])) if dropped else None
+    return tensors, table, observation_space, image_spaces or {}, (len(dropped), str(dropped[0])) if dropped else None
 
 
 def _checked(

@@ -1,28 +1,26 @@
 """Flat tensors of steps, where episodes lie in them, and how windows are drawn."""
 
-import copy
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
-from typing import TypeVar
 
 import numpy as np
 import torch as th
 
 from sb3_dtfm.data.episodes import EpisodeTable
 from sb3_dtfm.data.storage import STEP_ARRAYS, MappedSteps
-from sb3_dtfm.windows import Windows
+from sb3_dtfm.windows import OBSERVATION, Windows
 
-SelfSteps = TypeVar("SelfSteps", bound="FlatSteps")
 
-# A buffer moves to an accelerator if it takes at most this share of the memory that is free there.
-DEVICE_MEMORY_SHARE = 0.5
+def channels_first(images: th.Tensor) -> th.Tensor:
+    """From (R, height, width, channels), or channels first, to (R, channels, height, width): another view of the numbers."""
+    return images if images.shape[1] == min(images.shape[1:]) else images.movedim(3, 1)
 
 
 class FlatSteps:
     """
     Steps of episodes in flat float32 tensors, drawn as windows that may end at any step.
 
-    :param tensors: (N, ...) for each of `STEP_ARRAYS`
+    :param tensors: (N, ...) for each of `STEP_ARRAYS`, and images by camera
     :param episodes: the own ones, which need not be all that lie in the tensors
     :param maps: the tensors that are files, of those that windows hold
     :ivar stored: the tensors, which buffers of other episodes share; the buffer's own steps lie at `rows`. To read them,
@@ -30,7 +28,8 @@ class FlatSteps:
     """
 
     def __init__(self, tensors: dict[str, th.Tensor], episodes: EpisodeTable, maps: Sequence[MappedSteps] = ()) -> None:
-        self.stored = {name: tensors[name] for name in STEP_ARRAYS}
+        self.stored = dict(tensors)
+        self.cameras = [name for name in tensors if name not in STEP_ARRAYS]
         self.device = tensors["observations"].device
         self.weights = np.ones(len(episodes.lengths))
         self._maps = maps
@@ -61,25 +60,25 @@ class FlatSteps:
     @property
     def observations(self) -> th.Tensor:
         """(len(self), O) float32, of the buffer's own steps, episode after episode."""
-        return self._own("observations")
+        return self.own("observations")
 
     @property
     def actions(self) -> th.Tensor:
         """(len(self), A) float32, in the environment's range; Discrete ones as vectors."""
-        return self._own("actions")
+        return self.own("actions")
 
     @property
     def rewards(self) -> th.Tensor:
         """(len(self),) float32, environment reward units."""
-        return self._own("rewards")
+        return self.own("rewards")
 
     @property
     def returns_to_go(self) -> th.Tensor:
         """(len(self),) float32, environment reward units."""
-        return self._own("returns_to_go")
+        return self.own("returns_to_go")
 
-    def _own(self, name: str) -> th.Tensor:
-        """Of the buffer's own steps; a copy where the tensor holds others, too."""
+    def own(self, name: str) -> th.Tensor:
+        """An array's rows of the buffer's own steps; a copy where the tensor holds others, too."""
         return self.stored[name] if self._is_whole else self.stored[name].index_select(0, self.rows)
 
     @property
@@ -92,24 +91,6 @@ class FlatSteps:
     def rows(self) -> th.Tensor:
         """(len(self),) int64, where the buffer's own steps lie in the stored tensors; made anew at each call."""
         return self._locate(th.arange(len(self), device=self._stops.device))[0]
-
-    def to(self: SelfSteps, device: th.device | str) -> SelfSteps:
-        """
-        The same buffer for batches on a device.
-
-        Its tensors move there if they take at most half of the memory that is free; otherwise each batch moves.
-        """
-        moved = copy.copy(self)
-        moved.device = th.device(device)
-        if moved.device.type == "cuda":
-            free, _ = th.cuda.mem_get_info(moved.device)
-            if sum(tensor.nbytes for tensor in self.stored.values()) > DEVICE_MEMORY_SHARE * free:
-                return moved
-        moved.stored = {name: tensor.to(moved.device) for name, tensor in self.stored.items()}
-        moved.device = moved.stored["observations"].device
-        moved._maps = self._maps if moved.device.type == "cpu" else ()
-        moved._set_episodes(self.episodes)
-        return moved
 
     def batches(
         self,
@@ -211,6 +192,8 @@ class FlatSteps:
             timesteps=timesteps.clamp_(min=0),
             mask=mask,
         )
+        if self.cameras:
+            batch = batch._replace(observations={OBSERVATION: batch.observations, **self.images(rows, mask.shape)})
         if n_ahead:
             ahead = th.arange(1, n_ahead + 1, device=last_rows.device)
             rows_ahead = last_rows.unsqueeze(1) + th.minimum(ahead, n_left.unsqueeze(1))
@@ -218,7 +201,17 @@ class FlatSteps:
             batch = batch._replace(actions=th.cat((batch.actions, actions_ahead), dim=1))
         if self.device.type == rows.device.type:
             return batch
-        return Windows(*(tensor.pin_memory().to(self.device, non_blocking=True) for tensor in batch))
+        return batch.map(lambda tensor: tensor.pin_memory().to(self.device, non_blocking=True))
+
+    def images(self, rows: th.Tensor, shape: Sequence[int]) -> dict[str, th.Tensor]:
+        """
+        Images by camera, (*shape, channels, height, width) uint8, of these rows of the stored tensors.
+
+        :param rows: (R,) int64
+        :param shape: of R numbers
+        """
+        found = {camera: self.stored[camera].index_select(0, rows) for camera in self.cameras}
+        return {camera: channels_first(image).unflatten(0, tuple(shape)) for camera, image in found.items()}
 
     def _locate(self, positions: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """Of positions among the buffer's own steps: rows in the flat tensors, time steps, and steps left in the episode."""

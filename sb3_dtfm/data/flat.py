@@ -14,12 +14,14 @@ from gymnasium import spaces
 
 from sb3_dtfm.actions import ActionSpace, bounds_of, choices_between
 from sb3_dtfm.data.arrays import CSV_SUFFIX, ENV_ID, EXPECTED, NPZ_SUFFIX, PARQUET_SUFFIX, Arrays, opened
+from sb3_dtfm.data.buffer import IMAGE as STORED_IMAGE
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, existing_file
-from sb3_dtfm.data.observations import chosen, in_space, part_of
+from sb3_dtfm.data.observations import Observed, is_images, observed, part_of
 from sb3_dtfm.data.short_episodes import ShortEpisodes, blocks
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import ActionRangeError, DatasetError, Trajectory, check_flags
+from sb3_dtfm.envs.return_to_go import IMAGE
 from sb3_dtfm.envs.success import SUCCESS
 
 # What others call the same array: the first that is there is read.
@@ -52,7 +54,7 @@ def warn_of_made_up_rewards(names: Iterable[str], source: str) -> None:
         return
     ends = {*TERMINATIONS, *TRUNCATIONS, *DONES, *EPISODES, ENDS, LENGTHS}
     read = {*OBSERVATIONS, *ACTIONS, *ends, *SUCCESSES, LOW, HIGH, ENV_ID, *NOT_NEEDED}
-    unread = sorted(name for name in names - read if not name.startswith("infos/"))
+    unread = sorted(name for name in names - read if not name.startswith(("infos/", STORED_IMAGE)))
     told = names & set(SUCCESSES)
     if told and not unread:
         return
@@ -159,6 +161,8 @@ def load_flat(
         action_keys = list(action_keys or arrays.columns(ACTIONS))
         actions = _actions(arrays, action_keys, action_space)
         keys = list(observation_keys or arrays.columns(OBSERVATIONS))
+        if observation_keys is None:
+            keys += [name for name in arrays.names if name.startswith(STORED_IMAGE)]
         observations = _observations(arrays, keys, len(actions), observation_space)
         ends = _ends(arrays, len(actions), max_episode_steps)
         warn_of_made_up_rewards(set(map(str, arrays.names)) - {*keys, *action_keys}, arrays.source)
@@ -181,7 +185,7 @@ class _Ends(NamedTuple):
 
 def _read(
     arrays: Arrays,
-    observation: np.ndarray,
+    observation: Observed,
     actions: np.ndarray,
     ends: _Ends,
     action_bounds: Sequence[Any] | None,
@@ -210,13 +214,14 @@ def _read(
         """Those of some episodes, one after the other."""
         start, stop = stops[first - 1] if first else 0, stops[end - 1]
         return Trajectory(
-            observations=observation[start:stop],
+            observations=observation.vectors[start:stop],
             actions=actions[start:stop],
             rewards=rewards[start:stop, 0],
             terminated=bool(terminated[stop - 1]),
             truncated=bool(truncated[stop - 1]),
             success=None if np.isnan(successes[first]) else bool(successes[first]),
             name=f"episode {first}",
+            images={camera: images[start:stop] for camera, images in observation.images.items()},
         )
 
     def episodes(first: int, end: int) -> Trajectory | ShortEpisodes:
@@ -253,18 +258,27 @@ def _actions(arrays: Arrays, keys: Sequence[str], space: ActionSpace | None) -> 
     return actions
 
 
-def _observations(arrays: Arrays, keys: Sequence[str], n_steps: int, space: spaces.Space | None) -> np.ndarray:
-    """(N, O), of arrays, or of entries of dictionary observations."""
+def _observations(arrays: Arrays, keys: Sequence[str], n_steps: int, space: spaces.Space | None) -> Observed:
+    """Of arrays, or of entries of dictionary observations."""
     if arrays.has(OBSERVATIONS) and not all(key in arrays.names for key in keys):
         name = arrays.name(OBSERVATIONS)
-        parts = {name: chosen(arrays.stored(name), keys, space, f"{arrays.source}: {name}")}
+        parts = {name: observed(arrays.stored(name), keys, space, f"{arrays.source}: {name}")}
     else:
         known = {key: space if key in OBSERVATIONS else part_of(space, key) for key in keys}
-        parts = {key: in_space(arrays.stored(arrays.name((key,))), known[key], f"{arrays.source}: {key}") for key in keys}
+        stored = {key: arrays.stored(arrays.name((key,))) for key in keys}
+        parts = {key: observed(stored[key], None, known[key], f"{arrays.source}: {key}") for key in keys}
+    images: dict[str, np.ndarray] = {}
     for name, part in parts.items():
-        if len(part) != n_steps:
-            raise DatasetError(f"{arrays.source}: {name} has shape {part.shape} and actions have {n_steps} steps.")
-    return np.concatenate(list(parts.values()), axis=1)
+        own = name if name not in OBSERVATIONS else IMAGE
+        images |= {
+            own.removeprefix(STORED_IMAGE) if camera == IMAGE else camera: each for camera, each in part.images.items()
+        }
+        for array in part:
+            found = next(iter(array.values()), part.vectors) if isinstance(array, dict) else array
+            if len(found) != n_steps:
+                raise DatasetError(f"{arrays.source}: {name} has shape {found.shape} and actions have {n_steps} steps.")
+    vectors = [part.vectors for name, part in parts.items() if not is_images(arrays.stored(name))]
+    return Observed(np.concatenate(vectors or [np.zeros((n_steps, 1), np.float32)], axis=1), images)
 
 
 def _ends(arrays: Arrays, n_steps: int, max_episode_steps: int | None) -> _Ends:

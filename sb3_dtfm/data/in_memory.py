@@ -30,7 +30,7 @@ from sb3_dtfm.data.flat import (
     told_flags,
     warn_of_made_up_rewards,
 )
-from sb3_dtfm.data.observations import chosen, chosen_space, flatten_chosen, in_space
+from sb3_dtfm.data.observations import chosen_space, flatten_chosen, observed
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_space, wrap_dataset_errors
 from sb3_dtfm.envs.return_to_go import flatten_observation_space
@@ -277,20 +277,18 @@ def _of_arrays(
 
     actions = np.asarray(find(ACTIONS))
     n_steps = len(actions) if actions.ndim else 0
-    if keys is None:
-        observations = in_space(find(OBSERVATIONS), space, f"{where}: observations")
-    else:
-        entries = arrays if all(key in arrays for key in keys) else find(OBSERVATIONS)
-        observations = chosen(entries, keys, space, f"{where}: observations")
-    if len(observations) == n_steps + 1:  # the last one, after which nobody has acted
-        observations = observations[:n_steps]
+    entries = arrays if keys is not None and all(key in arrays for key in keys) else find(OBSERVATIONS)
+    seen = observed(entries, keys, space, f"{where}: observations")
+    if len(seen.vectors) == n_steps + 1:  # the last one, after which nobody has acted
+        seen = seen.first(n_steps)
     has_rewards = any(key in arrays for key in REWARDS)
     success = _success(arrays, n_steps, where)
     rewards = np.asarray(find(REWARDS)) if has_rewards else (success is not False) * np.eye(1, n_steps, n_steps - 1)[0]
     terminated, truncated, done = flag(TERMINATIONS), flag(TRUNCATIONS), flag(DONES)
     terminated = terminated or (done and not truncated)
     return Trajectory(
-        observations=observations,
+        observations=seen.vectors,
+        images=seen.images,
         actions=actions,
         rewards=rewards.reshape(n_steps) if rewards.size == n_steps else rewards,
         terminated=terminated or not (has_rewards or truncated or success is False),

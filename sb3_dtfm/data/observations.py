@@ -3,13 +3,13 @@
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from gymnasium import spaces
 
 from sb3_dtfm.data.trajectories import DatasetError, check_real
-from sb3_dtfm.envs.return_to_go import sort_observation_space
+from sb3_dtfm.envs.return_to_go import IMAGE, sort_observation_space, without_images
 
 # How a JPEG image begins.
 JPEG = b"\xff\xd8\xff"
@@ -21,6 +21,51 @@ STORED_AS_JPEG = (
     "hold JPEG images, as which Minari stores arrays of bytes; images cannot be used, and vectors are read if they are "
     "recorded as another type than uint8."
 )
+
+
+class Observed(NamedTuple):
+    """
+    :param vectors: (T, O)
+    :param images: (T, height, width, channels) uint8, or channels first, by camera
+    """
+
+    vectors: np.ndarray
+    images: dict[str, np.ndarray]
+
+    def first(self, n_steps: int) -> "Observed":
+        """Without what was observed after so many steps."""
+        return Observed(self.vectors[:n_steps], {camera: images[:n_steps] for camera, images in self.images.items()})
+
+
+def observed(observations: Any, keys: Sequence[str] | None, space: spaces.Space | None, where: str) -> Observed:
+    """
+    Observations with their images apart.
+
+    :param observations: (T, ...), or a dictionary of such
+    :param keys: entries of the dictionary, cameras too, that make up the observation, in this order; None for all
+    :param space: the environment's observation space; None where nobody tells
+    :param where: whose they are, for messages
+    :return: without vectors a single number that is always 0
+    :raises DatasetError: as :func:`in_space` and :func:`chosen`
+    """
+    entries = observations if isinstance(observations, Mapping) else {IMAGE: observations}
+    names = list(entries) if keys is None else keys
+    images = {str(name): np.asarray(entries[name]) for name in names if name in entries and is_images(entries[name])}
+    if not images:
+        vectors = in_space(observations, space, where) if keys is None else chosen(observations, keys, space, where)
+        return Observed(vectors, {})
+    others = [name for name in names if name not in images]
+    space = None if space is None else without_images(space)
+    if not others:
+        return Observed(np.zeros((len(next(iter(images.values()))), 1), np.float32), images)
+    if keys is None:
+        return Observed(in_space({name: entries[name] for name in others}, space, where), images)
+    return Observed(chosen(entries, others, space, where), images)
+
+
+def is_images(array: Any) -> bool:
+    """Whether this is an image a step: bytes with three axes each."""
+    return not isinstance(array, Mapping) and np.asarray(array).dtype == np.uint8 and np.ndim(array) == 4
 
 
 def as_vectors(observations: Any, where: str) -> np.ndarray:
@@ -142,8 +187,12 @@ def check_no_images(array: np.ndarray, where: str) -> None:
     :param where: whose it is, for messages
     :raises DatasetError: bytes with more than one axis a step
     """
-    if array.dtype == np.uint8 and array.ndim > 2:
-        raise DatasetError(f"{where} has shape {array.shape} and holds images; only vectors of numbers can be used.")
+    bytes_of_images = array.dtype == np.uint8 and array.ndim > 2
+    if bytes_of_images or (array.ndim == 4 and {array.shape[1], array.shape[3]} & {1, 3, 4}):
+        raise DatasetError(
+            f"{where} is {array.dtype} of shape {array.shape}, expected images as uint8 of (steps, height, width, "
+            "channels), 0 to 255, or vectors of numbers; of floats from 0 to 1 write (255 * images).astype(np.uint8)."
+        )
 
 
 def flatten_observations(read: ReadArray, path: tuple[str | int, ...], space: spaces.Space, where: str) -> list[np.ndarray]:

@@ -30,6 +30,7 @@ from sb3_dtfm.data.minari import fingerprint_minari, is_minari, load_minari
 from sb3_dtfm.data.pickles import unpickled, without_pickles
 from sb3_dtfm.data.robomimic import fingerprint_robomimic, is_robomimic, load_robomimic
 from sb3_dtfm.data.trajectories import DatasetError
+from sb3_dtfm.data.zarr_replay import fingerprint_zarr, is_zarr, load_zarr
 
 # All that is accepted as a dataset; load_dataset says more.
 Dataset: TypeAlias = (
@@ -119,6 +120,7 @@ READERS = (
         fingerprint_flat_file,
     ),
     Reader("the path of a LeRobot dataset (a folder)", is_lerobot, load_lerobot, fingerprint_lerobot),
+    Reader("the path of a zarr replay buffer (.zarr, .zarr.zip)", is_zarr, load_zarr, fingerprint_zarr),
     Reader("the path of a robomimic file (.hdf5)", is_robomimic, load_robomimic, fingerprint_robomimic),
     Reader("a Minari id (namespace/name-vN) or MinariDataset", is_minari, load_minari, fingerprint_minari),
     Reader("a dictionary of flat arrays", is_mapping, load_flat, None),
@@ -222,7 +224,8 @@ def _check_options(given: dict[str, Any]) -> None:
             raise ValueError(f"{name} must be {expected}, or None, got {value!r}.")
     for name in ("observation_keys", "action_keys"):
         value = given.get(name)
-        names = isinstance(value, Sequence) and not isinstance(value, str) and all(isinstance(each, str) for each in value)
+        listed: Any = list(value.values()) if isinstance(value, Mapping) else value
+        names = isinstance(listed, Sequence) and not isinstance(listed, str) and all(isinstance(x, str) for x in listed)
         if value is not None and not (names and value):
             raise ValueError(f"{name} must be a list of names, or None, got {value!r}.")
 

@@ -16,6 +16,7 @@ from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, existing_file
 from sb3_dtfm.data.flat import fitted, warn_of_made_up_rewards
 from sb3_dtfm.data.hdf5 import check_within, listed, open_group, open_hdf5, read_hdf5
+from sb3_dtfm.data.observations import Observed, is_images, observed
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_finite, check_flags, wrap_dataset_errors
 from sb3_dtfm.envs.robosuite import arm_controller, differences_from_robomimic, env_id_from_robomimic
@@ -151,11 +152,12 @@ def _read(
         where = f"{source}, {name}"
         with wrap_dataset_errors(where):
             length, dones = len(rewards[name]), labels[name].dones
-            observations = _observations(groups[name], where, labels[name].n_steps, observation_keys)
+            seen = _observations(groups[name], where, labels[name].n_steps, observation_keys)
             success = bool(rewards[name][-1] >= 1.0)
             done = dones is not None and bool(dones[length - 1])
             return Trajectory(
-                observations=_present_object_state(observations, observation_keys, env_args)[:length],
+                observations=_present_object_state(seen.vectors, observation_keys, env_args)[:length],
+                images=seen.first(length).images,
                 actions=fitted(read_hdf5(groups[name], "actions", where)[:length], action_space, clip_actions),
                 rewards=rewards[name],
                 terminated=success,
@@ -265,10 +267,10 @@ def _rewards(labels: dict[str, _Labels]) -> dict[str, np.ndarray]:
     return rewards
 
 
-def _observations(demo: h5py.Group, where: str, n_steps: int, keys: tuple[str, ...]) -> np.ndarray:
-    """The chosen observations side by side, (T, O)."""
+def _observations(demo: h5py.Group, where: str, n_steps: int, keys: tuple[str, ...]) -> Observed:
+    """The chosen observations, vectors side by side and images by camera."""
     group = open_group(demo, "obs", where)
-    names, parts = set(group), []
+    names, entries = set(group), {}
     for key in keys:
         name = key if key in names else ALIASES.get(key, key)
         if name not in names:
@@ -276,13 +278,13 @@ def _observations(demo: h5py.Group, where: str, n_steps: int, keys: tuple[str, .
         array = read_hdf5(group, name, where)
         if array.ndim == 1:
             array = array[:, None]
-        if array.ndim != 2 or len(array) != n_steps:
+        if len(array) != n_steps or not (array.ndim == 2 or is_images(array)):
             raise DatasetError(
-                f"{where}: observation {name!r} has shape {array.shape}, expected ({n_steps}, dimensions), "
-                "one row for each action."
+                f"{where}: observation {name!r} is {array.dtype} of shape {array.shape}, expected ({n_steps}, dimensions), "
+                f"one row for each action, or uint8 images ({n_steps}, height, width, channels)."
             )
-        parts.append(array)
-    return np.concatenate(parts, axis=1)
+        entries[key] = array
+    return observed(entries, keys, None, where)
 
 
 def _present_object_state(observations: np.ndarray, keys: tuple[str, ...], env_args: dict[str, Any]) -> np.ndarray:

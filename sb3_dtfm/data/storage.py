@@ -5,7 +5,8 @@ import contextlib
 import mmap
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+from urllib.parse import quote
 
 import numpy as np
 import torch as th
@@ -13,6 +14,7 @@ from tqdm import tqdm
 
 from sb3_dtfm.data.trajectories import DatasetError
 
+# Of float32; all others are images, uint8 by the name of their camera.
 STEP_ARRAYS = ("observations", "actions", "rewards", "returns_to_go")
 # A build that takes longer than this many seconds shows a progress bar.
 PROGRESS_DELAY = 3.0
@@ -23,7 +25,7 @@ CAN_ADVISE = hasattr(mmap.mmap, "madvise")
 
 
 class MemoryStorage:
-    """Float32 arrays in memory, made at once for an announced number of steps; they grow if there are more."""
+    """Arrays in memory, made at once for an announced number of steps; they grow if there are more."""
 
     def __init__(self) -> None:
         self._arrays: dict[str, np.ndarray] = {}
@@ -38,7 +40,7 @@ class MemoryStorage:
         """
         Copy the steps of one more episode.
 
-        :param steps: (T, ...) for each of `STEP_ARRAYS`
+        :param steps: (T, ...) for each of `STEP_ARRAYS`, and for each camera
         """
         stop = self._n_steps + len(steps["rewards"])
         if stop > self._capacity or not self._arrays:
@@ -50,7 +52,8 @@ class MemoryStorage:
 
     def _larger(self, name: str, values: np.ndarray) -> np.ndarray:
         # Torch's memory: numpy asks for huge pages, which a virtual machine may have to gather first.
-        array = th.empty(self._capacity, *values.shape[1:], dtype=th.float32).numpy()
+        dtype = th.float32 if name in STEP_ARRAYS else th.uint8
+        array = th.empty(self._capacity, *values.shape[1:], dtype=dtype).numpy()
         if name in self._arrays:
             array[: self._n_steps] = self._arrays[name][: self._n_steps]
         return array
@@ -62,7 +65,7 @@ class MemoryStorage:
 
 class FileStorage:
     """
-    One `.npy` file of float32 per array, written from front to back and memory-mapped when complete.
+    One `.npy` file per array, written from front to back and memory-mapped when complete.
 
     Plain writes instead of a map of the growing file: a full disk is an error then and not a crash, and what was written
     does not count as this process's memory.
@@ -86,7 +89,7 @@ class FileStorage:
         """
         Write the steps of one more episode.
 
-        :param steps: (T, ...) for each of `STEP_ARRAYS`
+        :param steps: (T, ...) for each of `STEP_ARRAYS`, and for each camera
         :raises DatasetError: the disk is full, for example
         """
         with self._writing():
@@ -96,7 +99,7 @@ class FileStorage:
                     self._files[name] = open(path, "wb", buffering=WRITE_BUFFER)  # noqa: SIM115 (close() does it)
                     self._shapes[name] = values.shape[1:]
                     self._write_header(name)
-                self._files[name].write(np.ascontiguousarray(values, np.float32).data)
+                self._files[name].write(np.ascontiguousarray(values, _dtype(name)).data)
         self._n_steps += len(steps["rewards"])
         self._bar.update(len(steps["rewards"]))
 
@@ -108,7 +111,11 @@ class FileStorage:
             raise DatasetError(f"cache {self.folder} cannot be written: {error}") from error
 
     def _write_header(self, name: str) -> None:
-        header = {"descr": "<f4", "fortran_order": False, "shape": (self._n_steps, *self._shapes[name])}
+        header = {
+            "descr": np.lib.format.dtype_to_descr(_dtype(name)),
+            "fortran_order": False,
+            "shape": (self._n_steps, *self._shapes[name]),
+        }
         np.lib.format.write_array_header_1_0(self._files[name], header)
 
     def finish(self) -> dict[str, th.Tensor]:
@@ -118,7 +125,7 @@ class FileStorage:
                 file.seek(0)
                 self._write_header(name)  # of the same length: numpy leaves room for the number of rows
             self.close()
-        return {name: MappedSteps(self.folder, name).tensor for name in STEP_ARRAYS}
+        return {name: MappedSteps(self.folder, name).tensor for name in self._files}
 
     def close(self) -> None:
         """Close the files, whatever has been written."""
@@ -127,21 +134,25 @@ class FileStorage:
             file.close()
 
 
+def _dtype(name: str) -> np.dtype[Any]:
+    return np.dtype("<f4" if name in STEP_ARRAYS else "u1")
+
+
 def step_file(folder: Path, name: str) -> Path:
-    """The file of one of `STEP_ARRAYS`."""
-    return folder / f"{name}.npy"
+    """The file of an array; of images the camera's name may hold any letters."""
+    return folder / f"{name if name in STEP_ARRAYS else 'image_' + quote(name, safe='')}.npy"
 
 
 class MappedSteps:
     """
-    One of `STEP_ARRAYS` as a tensor whose numbers are read from its file when they are used.
+    An array as a tensor whose numbers are read from its file when they are used.
 
     Windows lie anywhere in the file. So the system is told to read no more than is used, and gets to know the windows of
     the next batch early and all at once: for cold pages that took 3 ms a batch, against 150 ms when each access to a page
     waited for the disk and for the neighbouring pages too.
 
     :param folder: of a cache
-    :param name: one of `STEP_ARRAYS`
+    :param name: one of `STEP_ARRAYS`, or a camera
     :ivar check: of the cache's files, where it still goes on
     :raises OSError: no such file
     :raises ValueError: not a npy file, or cut off

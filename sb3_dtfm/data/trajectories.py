@@ -2,12 +2,13 @@
 
 import contextlib
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_dtfm.actions import ActionSpace
 
@@ -108,6 +109,7 @@ class Trajectory:
     :param terminated: the last step reached a terminal state
     :param truncated: the last step hit a time limit; neither flag set means that the recording stopped mid-episode
     :param success: whether the task was done at the last step; None where the data do not tell
+    :param images: by camera, (T, height, width, channels) uint8, or channels first
     :param name: what the file calls this episode, for error messages
     """
 
@@ -118,6 +120,7 @@ class Trajectory:
     truncated: bool = False
     success: bool | None = None
     name: str = "episode"
+    images: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -238,10 +241,16 @@ def check_action_space(space: spaces.Space, source: str) -> ActionSpace:
 
 
 def check_trajectory(
-    trajectory: Trajectory, observation_space: spaces.Box, action_space: ActionSpace, source: str
+    trajectory: Trajectory,
+    observation_space: spaces.Box,
+    action_space: ActionSpace,
+    source: str,
+    image_spaces: Mapping[str, spaces.Box] | None = None,
 ) -> np.ndarray:
     """
     Refuse an episode that training must not see.
+
+    :param image_spaces: of its images, by camera; None takes them as they are
 
     :return: (T,) float64, the returns-to-go, which have been looked at, too
     :raises DatasetError: names source, episode and step, what was found and what is accepted
@@ -265,6 +274,7 @@ def check_trajectory(
         if np.shape(array) != shape:
             raise DatasetError(f"{where}: {name} have shape {np.shape(array)}, expected {shape}.")
         check_finite(array, name, where)
+    check_images(trajectory.images, image_spaces, n_steps, where)
     if isinstance(action_space, spaces.Discrete):
         _check_choices(trajectory.actions, action_space, where)
     else:
@@ -272,6 +282,42 @@ def check_trajectory(
     to_go = returns_to_go(trajectory.rewards)
     check_finite(to_go, "returns-to-go, sums of rewards,", where)
     return to_go
+
+
+def check_images(
+    images: Mapping[str, np.ndarray], image_spaces: Mapping[str, spaces.Box] | None, n_steps: int, where: str
+) -> None:
+    """
+    :param images: of an episode, by camera
+    :param image_spaces: of all episodes; None where this is the first one
+    :param n_steps: T
+    :raises DatasetError: other cameras, sizes or numbers than bytes, or not one image a step
+    """
+    if image_spaces is not None and images.keys() != image_spaces.keys():
+        raise DatasetError(f"{where}: has images of {listed(images)}, and the episodes before of {listed(image_spaces)}.")
+    for camera, array in images.items():
+        if array.dtype != np.uint8 or array.ndim != 4 or 0 in array.shape:
+            raise DatasetError(
+                f"{where}: images of {camera!r} are {array.dtype} of shape {array.shape}, expected uint8 of (steps, height, "
+                "width, channels), 0 to 255; of floats from 0 to 1 write (255 * images).astype(np.uint8)."
+            )
+        if len(array) != n_steps:
+            raise DatasetError(f"{where}: has {len(array)} images of {camera!r}, expected {n_steps}, one for each action.")
+        space = spaces.Box(0, 255, array.shape[1:], np.uint8)
+        if not is_image_space(space, check_channels=True):
+            raise DatasetError(
+                f"{where}: images of {camera!r} have shape {array.shape[1:]}, expected 1, 3 or 4 channels, first or last."
+            )
+        if image_spaces is not None and array.shape[1:] != image_spaces[camera].shape:
+            before = image_spaces[camera].shape
+            raise DatasetError(
+                f"{where}: images of {camera!r} have shape {array.shape[1:]}, and those of the episodes before {before}."
+            )
+
+
+def listed(names: Any) -> str:
+    """Names in a message."""
+    return ", ".join(map(repr, names)) or "no camera"
 
 
 def _check_inside(actions: np.ndarray, space: spaces.Box, where: str) -> None:

@@ -23,14 +23,14 @@ TOLERANCE = 1e-3
 
 
 def write_onnx(
-    path: str | PathLike[str], module: nn.Module, inputs: dict[str, th.Tensor], outputs: list[str], settings: dict[str, Any]
+    path: str | PathLike[str], module: nn.Module, inputs: dict[str, Any], outputs: list[str], settings: dict[str, Any]
 ) -> None:
     """
     Write a module as a graph, once it has been seen to give the module's numbers.
 
     :param path: file to write
     :param module: in evaluation mode, on the CPU
-    :param inputs: of its `forward` by name, each (B, ...); another B will do as well
+    :param inputs: of its `forward` by name, each (B, ...), or a dictionary of such; another B will do as well
     :param outputs: names of what it returns
     :param settings: what JSON can hold, for the file's metadata
     :raises ImportError: names the extra that is missing
@@ -51,19 +51,28 @@ def write_onnx(
             graph.model.metadata_props[METADATA] = json.dumps(settings)
             graph.save(str(beside), external_data=False)
         session = onnxruntime.InferenceSession(str(beside), providers=["CPUExecutionProvider"])
-        found = session.run(outputs, {name: each.numpy() for name, each in inputs.items()})
+        found = session.run(outputs, {name: each.numpy() for name, each in _flat(inputs).items()})
         for name, ours, theirs in zip(outputs, module(**inputs), found, strict=True):
             expected = ours.numpy()
             if not np.allclose(theirs, expected, rtol=0.0, atol=TOLERANCE * np.abs(expected).max()):
                 raise ValueError(f"{path}: {name} of the file differs from PyTorch's; please report it.")
 
 
-def _graph(module: nn.Module, inputs: dict[str, th.Tensor], outputs: list[str]) -> Any:
+def _flat(inputs: dict[str, Any]) -> dict[str, th.Tensor]:
+    """Inputs by name, those of a dictionary by their own."""
+    flat: dict[str, th.Tensor] = {}
+    for name, each in inputs.items():
+        flat |= each if isinstance(each, dict) else {name: each}
+    return flat
+
+
+def _graph(module: nn.Module, inputs: dict[str, Any], outputs: list[str]) -> Any:
     """:return: torch's ONNXProgram"""
-    rows = {name: {0: th.export.Dim("batch")} for name in inputs}
+    batch = {0: th.export.Dim("batch")}
+    rows = {name: dict.fromkeys(each, batch) if isinstance(each, dict) else batch for name, each in inputs.items()}
     # Captured here, by the one way whose graph is for all inputs: left alone, the exporter tries others if that one fails.
     program = th.export.export(module, (), kwargs=inputs, dynamic_shapes=rows, strict=False)
-    names: dict[str, Any] = {"input_names": list(inputs), "output_names": outputs, "dynamic_shapes": rows}
+    names: dict[str, Any] = {"input_names": list(_flat(inputs)), "output_names": outputs, "dynamic_shapes": rows}
     return th.onnx.export(program, opset_version=OPSET, dynamo=True, verbose=False, **names)
 
 

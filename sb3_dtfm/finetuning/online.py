@@ -1,7 +1,7 @@
 """A DTFM that goes on learning from episodes of its own."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from os import PathLike
 from typing import Any, NamedTuple, TypeVar
 
@@ -22,7 +22,8 @@ from sb3_dtfm.envs import OBSERVATION, return_to_go_space
 from sb3_dtfm.envs.success import reported_success
 from sb3_dtfm.optimization import OWN_BATCHES, RunningMeans
 from sb3_dtfm.policies.context import Context
-from sb3_dtfm.windows import Transitions, Windows
+from sb3_dtfm.transitions import Transitions
+from sb3_dtfm.windows import Windows
 
 SelfOnlineDTFM = TypeVar("SelfOnlineDTFM", bound="OnlineDTFM")
 
@@ -30,6 +31,17 @@ ACCEPTED: dict[str, Rule] = {
     "n_episodes": COUNT,
     "gradient_steps": COUNT,
 }
+
+
+def joined(batches: Sequence[Any]) -> Any:
+    """Windows, or transitions, of several batches one after the other."""
+
+    def join(parts: tuple[Any, ...]) -> Any:
+        if not isinstance(parts[0], dict):
+            return th.cat(parts)
+        return {name: th.cat([part[name] for part in parts]) for name in parts[0]}
+
+    return type(batches[0])(*map(join, zip(*batches, strict=True)))
 
 
 class Step(NamedTuple):
@@ -264,7 +276,7 @@ class OnlineDTFM(DTFM):
         streams = [self._batches(self.buffer, self.batch_size - n_own)] if n_own < self.batch_size else []
         if imitated is not None:
             streams.append(self._batches(imitated, n_own, OWN_BATCHES))
-        return (Windows(*map(th.cat, zip(*batches, strict=True))) for batches in zip(*streams, strict=True))
+        return (joined(batches) for batches in zip(*streams, strict=True))
 
     def _n_own(self, own: TrajectoryBuffer, batch_size: int) -> int:
         """How many of a batch are from own episodes, so that their steps count as much as the dataset's."""
@@ -281,7 +293,7 @@ class OnlineDTFM(DTFM):
         if n_own == batch_size:
             return own
         others = super()._sample_transitions(batch_size - n_own, generator)
-        return Transitions(*map(th.cat, zip(others, own, strict=True)))
+        return joined((others, own))
 
     def _name_steps(self, n_steps: int) -> str:
         return (

@@ -235,20 +235,6 @@ class FlowHead(ActionHead):
 
         return integrate(field, noise, flow_solver, flow_steps)
 
-    def paths(self, hidden: th.Tensor, noise: th.Tensor, n_points: int = 50) -> th.Tensor:
-        """
-        What lies between noise and actions, to be looked at.
-
-        :param hidden: (..., D)
-        :param noise: (..., A), standard normal
-        :param n_points: N, at equal distances in time, by as many Euler steps
-        :return: (N + 1, ..., A), the noise first, the actions last
-        """
-        points: list[th.Tensor] = []
-        with self.vector_field.register_forward_pre_hook(lambda _, inputs: points.append(inputs[0])):
-            end = self.solve(hidden, noise, "euler", n_points)
-        return th.stack([*points, end])
-
     def part_masks(self, mask: th.Tensor) -> dict[str, th.Tensor]:
         return {"one_step_loss": mask[:, -1]} if self.one_step_policy is not None else {}
 

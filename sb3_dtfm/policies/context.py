@@ -6,6 +6,7 @@ Pure functions: each returns new arrays and leaves its arguments alone, so a con
 
 import math
 import zlib
+from collections.abc import Sequence
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
@@ -118,6 +119,7 @@ def push(
     return_to_go: np.ndarray,
     timestep: np.ndarray,
     episode_start: np.ndarray | None = None,
+    frames: Sequence[np.ndarray] | None = None,
 ) -> Context:
     """
     Add a step to every row; its action stays zero until :func:`with_action`. Rows start anew where :func:`restarts` says so.
@@ -126,13 +128,17 @@ def push(
     :param return_to_go: (B,)
     :param timestep: (B,) int64
     :param episode_start: (B,) bool
+    :param frames: (B, ...) each, what tells episodes apart at their start; the observation alone if not given
     """
     restart = restarts(context, timestep, episode_start)
     starting = np.flatnonzero(restart)
     if len(starting):
         context = _empty_rows(context, restart)
     for row in starting:
-        context.episode_keys[row] = zlib.crc32(observation[row].astype(np.float32) + 0.0)  # no negative zeros
+        key = 0
+        for frame in (observation.astype(np.float32),) if frames is None else frames:
+            key = zlib.crc32((frame[row] + frame.dtype.type(0)).tobytes(), key)  # no negative zeros
+        context.episode_keys[row] = key
     return context._replace(
         observations=_shift(context.observations, observation),
         actions=_shift(context.actions, 0.0),

@@ -11,7 +11,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_dtfm.windows import Transitions
+from sb3_dtfm.transitions import Transitions
 
 # Kostrikov et al. (2022): how fast the network that backups look at follows, and the rate at which all learn.
 TARGET_SHARE = 0.005

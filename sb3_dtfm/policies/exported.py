@@ -22,7 +22,8 @@ class ExportedPolicy(nn.Module):
     Whoever calls it keeps the windows: shifts them by a step, puts in the newest one, and when the action is carried out
     that, too. A row begins anew when its mask is cleared; what is behind the mask may be any finite number.
 
-    Actions of a Discrete space are vectors here: 1 for the choice, 0 for the others.
+    Actions of a Discrete space are vectors here: 1 for the choice, 0 for the others. Of images the newest ones go in, and
+    features of earlier ones are state in and state out.
 
     :param policy: stays as it is; what acts of it is copied to the CPU
     :raises ValueError: its critic would choose among several draws
@@ -46,7 +47,8 @@ class ExportedPolicy(nn.Module):
         self.settings: dict[str, Any] = {
             "context_length": policy.context_length,
             "chunk_size": policy.options.chunk_size,
-            "observation_dim": policy.observation_dim,
+            "observation_dim": policy.vector_dim,
+            "images": {camera: list(space.shape) for camera, space in policy.image_spaces.items()},
             "action_dim": policy.action_dim,
             "action_low": policy.vector_space.low.tolist(),
             "action_high": policy.vector_space.high.tolist(),
@@ -67,6 +69,8 @@ class ExportedPolicy(nn.Module):
         noise: th.Tensor | None = None,
         episode_keys: th.Tensor | None = None,
         keys_values: th.Tensor | None = None,
+        features: th.Tensor | None = None,
+        images: dict[str, th.Tensor] | None = None,
     ) -> tuple[th.Tensor, ...]:
         """
         :param observations: (B, K, O), newest step last, as the environment gives them
@@ -76,12 +80,20 @@ class ExportedPolicy(nn.Module):
         :param mask: (B, K) bool, False on padded steps
         :param noise: (B, N), standard normal; a row of zeros takes what `predict(deterministic=True)` takes. For a head
             that starts from noise
-        :param episode_keys: (B,) int64, CRC-32 of the bytes of each episode's first observation, float32; with `noise`
+        :param episode_keys: (B,) int64, CRC-32 of the bytes of each episode's first observation, float32, and behind it
+            those of its images; with `noise`
         :param keys_values: (B, layers, 2, L, D), what the last call returned or any finite numbers; for `kv_cache`
+        :param features: (B, K, F), what the last call returned or any finite numbers; with images
+        :param images: of the newest step, (B, channels, height, width) uint8 by camera
         :return: chunk (B, H, A), the actions for this step and the next ones, in the action space; with `kv_cache` the
-            next `keys_values`
+            next `keys_values`; with images the next `features`
         """
         trunk = self.network.trunk
+        seen: tuple[th.Tensor, ...] = ()
+        if images is not None and features is not None and self.network.encoder is not None:
+            newest_features = self.network.encoder(images).unsqueeze(1)
+            seen = (th.cat((features[:, 1:], newest_features), dim=1),)
+            observations = th.cat((observations, *seen), dim=-1)
         given = Windows(observations, self.normalization.scale_action(actions), returns_to_go, timesteps, mask)
         normalized = self.normalization(given)
         windows = self.network.within_range(normalized)._asdict()
@@ -101,9 +113,9 @@ class ExportedPolicy(nn.Module):
         newest = Windows(*(each[:, -1:] for each in given))
         chunk = choose_actions(self.network, self.normalization, self.online_actor, newest, hidden, noise)
         chunk = chunk.unflatten(1, (-1, self.settings["action_dim"]))
-        return self.normalization.unscale_action(chunk), *kept
+        return self.normalization.unscale_action(chunk), *kept, *seen
 
-    def example(self, n_rows: int = 2) -> dict[str, th.Tensor]:
+    def example(self, n_rows: int = 2) -> dict[str, Any]:
         """
         Inputs of :meth:`forward` by name, those that this policy takes: full windows of random numbers.
 
@@ -115,8 +127,9 @@ class ExportedPolicy(nn.Module):
         def draw(*shape: int) -> th.Tensor:
             return th.randn(shape, generator=generator)
 
-        inputs = {
-            "observations": self.normalization.observation_mean + draw(*shape, self.settings["observation_dim"]),
+        mean = self.normalization.observation_mean[: self.settings["observation_dim"]]
+        inputs: dict[str, Any] = {
+            "observations": mean + draw(*shape, self.settings["observation_dim"]),
             "actions": self.normalization.unscale_action(draw(*shape, self.settings["action_dim"])),
             "returns_to_go": self.normalization.return_scale * draw(*shape),
             "timesteps": th.arange(self.context_length).repeat(n_rows, 1),
@@ -127,9 +140,16 @@ class ExportedPolicy(nn.Module):
         if self.keeps:
             n_kept = trunk.n_tokens(self.context_length) - trunk.tokens_per_step
             inputs["keys_values"] = draw(n_rows, trunk.n_layers, 2, n_kept, trunk.embed_dim)
+        if self.network.encoder is not None:
+            inputs["features"] = draw(*shape, self.network.encoder.features_dim)
+            inputs["images"] = {
+                camera: th.randint(0, 256, (n_rows, *size), dtype=th.uint8, generator=generator)
+                for camera, size in self.settings["images"].items()
+            }
         return inputs
 
     @property
     def outputs(self) -> list[str]:
         """Names of what :meth:`forward` returns."""
-        return ["chunk", "next_keys_values"] if self.keeps else ["chunk"]
+        kept = ["next_keys_values"] if self.keeps else []
+        return ["chunk", *kept, *(["next_features"] if self.network.encoder is not None else [])]

@@ -1,15 +1,18 @@
 """Everything that is trained: trunk, head, and the expected range of returns-to-go."""
 
-import numpy as np
+from typing import Any
+
 import torch as th
 from torch import nn
 
 from sb3_dtfm.heads import ActionHead
-from sb3_dtfm.networks.cache import extend_cache
 from sb3_dtfm.networks.layers import Linear
 from sb3_dtfm.networks.trunk import SequenceTrunk
-from sb3_dtfm.windows import Windows
+from sb3_dtfm.policies.images import ImageEncoder
+from sb3_dtfm.windows import OBSERVATION, Windows
 
+# An image's, of 84 x 84 by the default extractor: convolutions keep all threads busy.
+N_MACS_OF_IMAGES = 25_000_000
 HIDDEN_DIM = 256
 # The lower and the upper expectile: 0.5 would be the mean twice, 0 and 1 the extremes.
 EXPECTILES = (0.05, 0.95)
@@ -60,15 +63,35 @@ class SequenceNetwork(nn.Module):
     :param trunk: from windows to hidden states
     :param head: from hidden states to actions
     :param return_range: what the return-to-go is kept within while acting; None leaves it alone
+    :param encoder: from images to features; None where there are no images
     :ivar n_macs: multiplications of a step of a window on the way forward, without attention's
     """
 
-    def __init__(self, trunk: SequenceTrunk, head: ActionHead, return_range: ReturnRange | None = None) -> None:
+    def __init__(
+        self,
+        trunk: SequenceTrunk,
+        head: ActionHead,
+        return_range: ReturnRange | None = None,
+        encoder: ImageEncoder | None = None,
+    ) -> None:
         super().__init__()
+        self.encoder = encoder
         self.trunk = trunk
         self.head = head
         self.return_range = return_range
         self.n_macs = trunk.tokens_per_step * _n_weights(trunk) + _n_weights(head)
+        if encoder is not None:
+            self.n_macs += N_MACS_OF_IMAGES
+
+    def see(self, observations: Any) -> th.Tensor:
+        """
+        :param observations: vectors (..., O), or a dictionary of these and of images by camera
+        :return: vectors (..., O), or (..., O + F) with the features of images behind
+        """
+        if self.encoder is None:
+            vectors: th.Tensor = observations
+            return vectors
+        return th.cat((observations[OBSERVATION], self.encoder(observations)), dim=-1)
 
     def draw_noise(self, batch: Windows, generator: th.Generator) -> tuple[th.Tensor, ...]:
         """
@@ -88,7 +111,9 @@ class SequenceNetwork(nn.Module):
         windows = batch._replace(actions=batch.actions[:, : batch.mask.shape[1]])
         loss, parts = self.head.loss(self.trunk(**windows._asdict()), chunks, windows.mask, *noise)
         if self.return_range is not None:
-            parts["return_range_loss"] = self.return_range.loss(windows.observations, windows.returns_to_go, windows.mask)
+            parts["return_range_loss"] = self.return_range.loss(
+                windows.observations.detach(), windows.returns_to_go, windows.mask
+            )
             loss = loss + parts["return_range_loss"]
         return loss, parts
 
@@ -101,14 +126,6 @@ class SequenceNetwork(nn.Module):
     def newest_hidden(self, windows: Windows) -> th.Tensor:
         """From windows (B, K, ...) to hidden states (B, D) of their newest steps."""
         return self.trunk(**self.within_range(windows)._asdict(), last_only=True).squeeze(1)
-
-    def extend(self, windows: Windows, cache: np.ndarray) -> tuple[th.Tensor, np.ndarray]:
-        """
-        :param windows: (B, K, ...)
-        :param cache: see :func:`~sb3_dtfm.networks.cache.extend_cache`
-        :return: (B, D) hidden states of the newest steps, and the new cache
-        """
-        return extend_cache(self.trunk, self.within_range(windows)._asdict(), cache)
 
     def decode(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
         """From hidden states (..., D) and noise (..., N) to chunks (..., H A) in [-1, 1]."""

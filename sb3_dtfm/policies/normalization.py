@@ -7,7 +7,8 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_dtfm.windows import Transitions, Windows
+from sb3_dtfm.transitions import Transitions
+from sb3_dtfm.windows import Windows
 
 # Observations are clipped at this many standard deviations, as SB3's VecNormalize does.
 OBSERVATION_CLIP = 10.0
@@ -25,7 +26,7 @@ class Normalization(nn.Module):
     """
     What inputs are normalised by, measured on the training data and saved with the weights; and the range of actions.
 
-    :param observation_dim: O
+    :param observation_dim: O, or O + F with the features of images behind, which stay as they are
     :param action_space: bounded Box (A,)
     :param max_timestep: T, the longest episode; time steps with a range of return-to-go of their own
     :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step
@@ -87,12 +88,12 @@ class Normalization(nn.Module):
         :param observation_robust_std: (O,), not larger; the divisor of "robust"
         :param return_scale: largest absolute return-to-go, environment reward units
         """
-        varies = observation_std > SMALLEST_STD
-        self.observation_mean.copy_(th.from_numpy(observation_mean))
-        self.observation_std.copy_(th.from_numpy(np.where(varies, observation_std, 1.0)))
+        vector, varies = slice(0, len(observation_mean)), observation_std > SMALLEST_STD  # features of images lie behind
+        self.observation_mean[vector] = th.from_numpy(observation_mean)
+        self.observation_std[vector] = th.from_numpy(np.where(varies, observation_std, 1.0))
         gain = np.zeros_like(observation_std)
         divisor = observation_robust_std if self.observation_scaling == "robust" else observation_std
-        self.observation_gain.copy_(th.from_numpy(np.divide(observation_std, divisor, out=gain, where=varies)))
+        self.observation_gain[vector] = th.from_numpy(np.divide(observation_std, divisor, out=gain, where=varies))
         self.return_scale.fill_(return_scale if return_scale > 0 else 1.0)
 
     def set_return_to_go_moments(self, moments: th.Tensor) -> None:

@@ -1,6 +1,8 @@
 """Options of the policy, which users give among `policy_kwargs`."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from sb3_dtfm.arguments import (
     BOOLEAN,
@@ -15,7 +17,30 @@ from sb3_dtfm.arguments import (
     option,
 )
 from sb3_dtfm.heads.base import NOISE_ROWS
+from sb3_dtfm.policies.images import EXTRACTORS
 from sb3_dtfm.policies.normalization import OBSERVATION_SCALINGS, RETURN_SCALINGS
+
+
+class Extractor:
+    """The name of a class for images."""
+
+    def accepts(self, value: Any) -> bool:
+        """Whether it is one."""
+        return isinstance(value, str) and value in EXTRACTORS
+
+    def __str__(self) -> str:
+        return f"one of {', '.join(EXTRACTORS)}, or entered in sb3_dtfm.policies.images.EXTRACTORS by its name"
+
+
+class Arguments:
+    """Arguments by name."""
+
+    def accepts(self, value: Any) -> bool:
+        """Whether it is a mapping by name, or None."""
+        return value is None or (isinstance(value, Mapping) and all(isinstance(name, str) for name in value))
+
+    def __str__(self) -> str:
+        return "arguments by name"
 
 
 @dataclass(frozen=True)
@@ -43,6 +68,11 @@ class PolicyOptions(Options):
     :param observation_scaling: "std" divides observations by their standard deviation, "robust" by the lower quartile of
         the episodes' standard deviations, for data in which some agents' observations vary far more; see
         :meth:`EpisodeTable.statistics`
+    :param features_extractor_class: of images, for each camera: ResidualExtractor, NatureCNN or another class of SB3's kind,
+        which stands in :data:`~sb3_dtfm.policies.images.EXTRACTORS` by its name
+    :param features_extractor_kwargs: of that class, for example `features_dim`
+    :param normalize_images: divide images by 255, as SB3 does
+    :param share_features_extractor: one extractor for all cameras instead of one each
     :param timestep_embedding: tell the trunk the absolute time step, as Decision Transformer does
     :param tokens_per_step: 3, return-to-go, observation and action, as Decision Transformer does; or 1, the sum of a step's
         return-to-go, its observation and the action before it: a third of the products
@@ -75,6 +105,10 @@ class PolicyOptions(Options):
     return_scaling: str = option("timestep", Choice(RETURN_SCALINGS))
     film_return_to_go: bool = option(True, BOOLEAN)
     observation_scaling: str = option("std", Choice(OBSERVATION_SCALINGS))
+    features_extractor_class: str = option("ResidualExtractor", Extractor())
+    features_extractor_kwargs: Mapping[str, Any] | None = option(None, Arguments())
+    normalize_images: bool = option(True, BOOLEAN)
+    share_features_extractor: bool = option(False, BOOLEAN)
     timestep_embedding: bool = option(False, BOOLEAN)
     tokens_per_step: int = option(1, Choice((1, 3)))
     critic_steps: int = option(0, Number(low=0, whole=True))
@@ -86,6 +120,9 @@ class PolicyOptions(Options):
     kv_cache: bool = option(False, BOOLEAN, acting=True)
 
     def __post_init__(self) -> None:
+        given: Any = self.features_extractor_class
+        if isinstance(given, type):  # a file can hold its name
+            vars(self)["features_extractor_class"] = given.__name__
         super().__post_init__()
         n_action_steps = (self.chunk_size + 1) // 2 if self.n_action_steps is None else self.n_action_steps
         accepted = {"n_action_steps": Number(low=1, high=self.chunk_size, whole=True)}

@@ -17,6 +17,7 @@ from sb3_dtfm.actions import ActionSpace, from_vectors, vector_space
 from sb3_dtfm.arguments import COUNT, NOT_NEGATIVE, check_arguments, with_nearest
 from sb3_dtfm.heads import ActionHead
 from sb3_dtfm.heads.base import NOISE_ROWS
+from sb3_dtfm.networks.cache import extend_cache
 from sb3_dtfm.networks.optimizer import FlatAdamW, FlatTensors
 from sb3_dtfm.networks.trunk import SequenceTrunk
 from sb3_dtfm.policies.context import (
@@ -31,11 +32,12 @@ from sb3_dtfm.policies.context import (
     with_plan,
 )
 from sb3_dtfm.policies.critic import Critic
+from sb3_dtfm.policies.images import ImageEncoder, image_spaces, unpack_images
 from sb3_dtfm.policies.memory import RememberedContext
 from sb3_dtfm.policies.network import ReturnRange, SequenceNetwork
 from sb3_dtfm.policies.normalization import Normalization
 from sb3_dtfm.policies.options import PolicyOptions
-from sb3_dtfm.windows import Windows
+from sb3_dtfm.windows import OBSERVATION, Windows, map_tensors
 
 
 class SequencePolicy(BasePolicy):
@@ -47,7 +49,8 @@ class SequencePolicy(BasePolicy):
     point of the distribution, and following the same mode for ever gets a robot arm stuck. The same rows in every episode
     would correlate the episodes.
 
-    :param observation_space: Dict of `observation` (O,), `return_to_go` (1,) and `timestep` (1,)
+    :param observation_space: Dict of `observation` (O,), `return_to_go` (1,) and `timestep` (1,), and images (channels,
+        height, width) uint8 by camera, whose features stand behind the observation for all that follows: (O + F,)
     :param action_space: bounded Box (A,); or Discrete, whose actions are vectors for all but `predict`, see
         :mod:`~sb3_dtfm.actions`
     :param lr_schedule: learning rate over the progress remaining, from 1 to 0
@@ -92,11 +95,14 @@ class SequencePolicy(BasePolicy):
         self.context_length = context_length
         self.weight_decay = weight_decay
         self.seed = seed
-        self.observation_dim = int(observation_space["observation"].shape[0])  # type: ignore[index]
+        self.vector_dim = int(observation_space["observation"].shape[0])  # type: ignore[index]
+        self.image_spaces = image_spaces(observation_space)
+        encoder = self._make_encoder()
+        self.observation_dim = self.vector_dim + (0 if encoder is None else encoder.features_dim)
         self.vector_space = vector_space(action_space)
         self.action_dim = int(self.vector_space.shape[0])
         self.normalization = self._make_normalization(max_timestep)
-        self.network = self._make_network(head_class, of_the_head)
+        self.network = self._make_network(head_class, of_the_head, encoder)
         self._constructor_arguments = {
             **given, "ema": ema, "seed": seed, **vars(self.options), **vars(self.network.head.options)
         }  # fmt: skip
@@ -126,7 +132,16 @@ class SequencePolicy(BasePolicy):
         sizes = (self.observation_dim, self.vector_space, max_timestep)
         return Normalization(*sizes, own.clip_return_to_go, scaling, own.observation_scaling)
 
-    def _make_network(self, head_class: type[ActionHead], of_the_head: dict[str, Any]) -> SequenceNetwork:
+    def _make_encoder(self) -> ImageEncoder | None:
+        own = self.options
+        if not self.image_spaces:
+            return None
+        extractor = (own.features_extractor_class, own.features_extractor_kwargs or {})
+        return ImageEncoder(self.image_spaces, *extractor, own.normalize_images, own.share_features_extractor)
+
+    def _make_network(
+        self, head_class: type[ActionHead], of_the_head: dict[str, Any], encoder: ImageEncoder | None
+    ) -> SequenceNetwork:
         own = self.options
         trunk = SequenceTrunk(
             self.observation_dim,
@@ -142,7 +157,7 @@ class SequencePolicy(BasePolicy):
         )
         head = head_class(own.embed_dim, own.chunk_size * self.action_dim, **of_the_head)
         ranged = own.return_range and own.clip_return_to_go and own.return_conditioning
-        return SequenceNetwork(trunk, head, ReturnRange(self.observation_dim) if ranged else None)
+        return SequenceNetwork(trunk, head, ReturnRange(self.observation_dim) if ranged else None, encoder)
 
     @classmethod
     def parameter_names(cls) -> set[str]:
@@ -173,7 +188,7 @@ class SequencePolicy(BasePolicy):
 
     def _make_optimizer(self, learning_rate: float) -> FlatAdamW:
         """AdamW whose weight decay spares biases, norms and embeddings."""
-        decayed = {id(module.weight) for module in self.network.modules() if isinstance(module, nn.Linear)}
+        decayed = {id(module.weight) for module in self.network.modules() if isinstance(module, nn.Linear | nn.Conv2d)}
         matrices = [parameter for parameter in self.network.parameters() if id(parameter) in decayed]
         others = [parameter for parameter in self.network.parameters() if id(parameter) not in decayed]
         return_range = self.network.return_range
@@ -221,7 +236,9 @@ class SequencePolicy(BasePolicy):
         :return: hidden states (B, D) of their newest steps, by the network that acts
         """
         self._stop_training()
-        return self.acting_network.newest_hidden(self.normalization.scale_batch(batch))
+        network = self.acting_network
+        seen = batch._replace(observations=network.see(batch.observations))
+        return network.newest_hidden(self.normalization.scale_batch(seen))
 
     def action_mse(self, batch: Windows, generator: th.Generator) -> th.Tensor:
         """
@@ -248,7 +265,8 @@ class SequencePolicy(BasePolicy):
         with th.no_grad():
             hidden = self.newest_hidden(batch)
             rows = th.randint(NOISE_ROWS, (len(hidden),), generator=generator, device=generator.device).cpu().numpy()
-            _, chosen = self._best_of_n(hidden, batch.observations[:, -1], rows, deterministic=True)
+            newest = self.acting_network.see(map_tensors(lambda each: each[:, -1], batch.observations))
+            _, chosen = self._best_of_n(hidden, newest, rows, deterministic=True)
             return (chosen != 0).float().mean()
 
     def predict(
@@ -269,7 +287,8 @@ class SequencePolicy(BasePolicy):
         Actions are finite and inside the action space. What cannot be acted on is an error before anything has changed: the
         caller mends the row that it names, or begins it anew, and asks again; the other rows go on as if nothing had been.
 
-        :param observation: Dict of `observation` (O,), `return_to_go` (1,), `timestep` (1,), or with a leading axis B
+        :param observation: Dict of `observation` (O,), `return_to_go` (1,), `timestep` (1,), or with a leading axis B, and
+            images by camera, channels first or last
         :param state: what the last call returned
         :param episode_start: (B,) bool, True where an environment was just reset
         :param deterministic: repeat exactly for the same model, state and inputs; otherwise draw fresh noise
@@ -277,7 +296,7 @@ class SequencePolicy(BasePolicy):
         :raises ValueError: not the observation of a `ReturnToGoWrapper`; a number that is not finite or a time step that is
             none, by key and row; a state of other environments, or one that holds no finite numbers
         """
-        arrays, vectorized = unpack_observation(observation, self.observation_dim)
+        arrays, frames, vectorized = self._unpack(observation)
         n_rows, timestep = len(arrays[0]), arrays[2]
         remembers = state is None and episode_start is None
         if episode_start is not None:
@@ -288,12 +307,28 @@ class SequencePolicy(BasePolicy):
             lost &= ~episode_start
         if lost.any():
             self._remembered.warn(f"Time step {timestep[lost][0]} follows none that is known: its past is missing.")
-        context = push(before, *arrays, episode_start=episode_start)
+        context = push(before, *arrays, episode_start=episode_start, frames=frames)
         context = self._act(context, deterministic)
         action = self._to_environment(context.actions[:, -1])
         if remembers:
             context = self._remembered.remember(before, context)
         return action if vectorized else action.squeeze(axis=0), context
+
+    def _unpack(self, observation: Any) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], list[np.ndarray], bool]:
+        """
+        :param observation: as for :meth:`predict`
+        :return: observation (B, O + F), return-to-go (B,) and time step (B,); vectors and images as they came, (B, ...)
+            each; and whether B was there
+        """
+        (vector, return_to_go, timestep), vectorized = unpack_observation(observation, self.vector_dim)
+        if not self.image_spaces:
+            return (vector, return_to_go, timestep), [vector], vectorized
+        images = unpack_images(observation, self.image_spaces, len(vector))
+        self._stop_training()
+        with th.inference_mode():
+            seen = {name: th.from_numpy(each).to(self.device) for name, each in {OBSERVATION: vector, **images}.items()}
+            features = self.acting_network.see(seen).cpu().numpy()
+        return (features, return_to_go, timestep), [vector, *images.values()], vectorized
 
     def _known(self, state: tuple[np.ndarray, ...] | None, n_rows: int) -> Context:
         """The context to go on from; a plan for another number of steps than are planned now is dropped."""
@@ -322,11 +357,11 @@ class SequencePolicy(BasePolicy):
         :return: the context with the newest step, and the trunk's hidden states (B, D)
         :raises ValueError: as :meth:`predict`
         """
-        arrays, _ = unpack_observation(observation, self.observation_dim)
+        arrays, frames, _ = self._unpack(observation)
         n_rows = len(arrays[0])
         if episode_start is not None:
             episode_start = check_episode_start(episode_start, n_rows)
-        context = push(self._known(state, n_rows), *arrays, episode_start=episode_start)
+        context = push(self._known(state, n_rows), *arrays, episode_start=episode_start, frames=frames)
         self._stop_training()
         with th.inference_mode():
             hidden, keys_values = self._hidden(context, np.ones(n_rows, bool))
@@ -470,7 +505,9 @@ class SequencePolicy(BasePolicy):
         windows = Windows(*(th.from_numpy(each if caches else each[due]).to(device) for each in context.windows))
         if not caches:
             return self.acting_network.newest_hidden(self.normalization(windows)), keys_values
-        hidden, keys_values = self.acting_network.extend(self.normalization(windows), context.keys_values)
+        network = self.acting_network
+        kept = network.within_range(self.normalization(windows))._asdict()
+        hidden, keys_values = extend_cache(network.trunk, kept, context.keys_values)
         return (hidden[th.from_numpy(due).to(device)] if due.any() else None), keys_values
 
     def _to_chunks(self, actions: th.Tensor) -> np.ndarray:
@@ -502,8 +539,8 @@ class SequencePolicy(BasePolicy):
         """Actions (B, A) in the environment's range for single steps without a past."""
         assert isinstance(observation, dict)
         numbers = {key: value.cpu().numpy() for key, value in observation.items()}
-        arrays, _ = unpack_observation(numbers, self.observation_dim)
-        context = self._act(push(self._empty_context(len(arrays[0])), *arrays), deterministic)
+        arrays, frames, _ = self._unpack(numbers)
+        context = self._act(push(self._empty_context(len(arrays[0])), *arrays, frames=frames), deterministic)
         return th.as_tensor(self._to_environment(context.actions[:, -1]), device=self.device)
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:

@@ -279,7 +279,7 @@ def train_arguments(argv: Sequence[str]) -> list[str]:
     if options.algo == FINETUNED:
         raise UsageError(f"--algo {FINETUNED}: such models come from `sb3-dtfm finetune`; `enjoy` plays them.")
     if options.dataset_fraction is not None and not 0.0 < options.dataset_fraction <= 1.0:
-        raise UsageError(f"--dataset-fraction: dataset_fraction must be a number in (0, 1], got {options.dataset_fraction}.")
+        raise UsageError(f"--dataset-fraction must be a number in (0, 1], got {options.dataset_fraction}.")
     import_packages(options.gym_packages)
     given = key_values("-params", options.hyperparams)
     conf_file = options.conf_file

@@ -290,7 +290,12 @@ def test_what_the_command_says_of_data_and_environment_goes_before_the_entry_key
     more = ["--env", "some", "--env-kwargs", "ctrl_cost_weight:0.3", "--dataset-cache", "cache", "--target-return", "9"]
     (job, *_), _ = plan(parse_arguments([*suite, *more]))
     assert job.settings["env_kwargs"] == {"max_episode_steps": 20, "ctrl_cost_weight": 0.3}
-    assert job.settings["dataset_kwargs"] == {"on_invalid": "drop", "cache_dir": "cache"}
+    assert job.settings["dataset_kwargs"] == {
+        "on_invalid": "drop",
+        "cache_dir": "cache",
+        "fraction": 0.67,
+        "fraction_seed": 0,
+    }
     assert asked_for(job.settings["env_wrapper"]) == 9.0
 
 

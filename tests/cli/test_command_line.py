@@ -114,7 +114,7 @@ def test_hyperparameters_can_be_searched(workplace, capsys):
         (tiny_training("dtfm", "--dataset", "no/such/file.hdf5"), "no/such/file.hdf5"),
         (
             tiny_training("dtfm", "--dataset", DATASET_ID, "--dataset-fraction", "2"),
-            "fraction must lie in (0, 1], got 2.0",
+            "--dataset-fraction must be a number in (0, 1], got 2.0",
         ),
         (tiny_training("dtfm", "--dataset", DATASET_ID, "--conf-file", "absent.yml"), "absent.yml: No such file"),
         (["train", "--algo", "dtfm", "--env", "HalfCheeta-v5"], "HalfCheetah-v5"),

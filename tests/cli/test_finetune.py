@@ -270,7 +270,7 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
     wrong = "vec_env_wrapper:['stable_baselines3.common.vec_env.VecMonitor']"
     cases = {
         "--model nowhere": "nowhere does not exist; --model names a DTFM's zip file or its run's folder.",
-        "--model logs/dt/HalfCheetah-v5_1": "was saved by DT, not by DTFM.",
+        "--model logs/dt/HalfCheetah-v5_1": "was saved by 'DT', not by DTFM.",
         "--model alone.zip": "--target-return R: needed, as alone.zip does not tell what return was asked for; "
         "`sb3-dtfm inspect DATASET` suggests one.",
         f"--model {run} --algo td3": "--algo td3: no packaged settings; those of dtfm, ppo, sac, tqc are.",

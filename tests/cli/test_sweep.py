@@ -56,7 +56,7 @@ def test_two_models_are_asked_for_the_range_of_their_data(workplace, capsys):
     assert main(["sweep", *slower, "speed:7"]) == 2
     errors = capsys.readouterr().err
     assert "--acting: flow_steps" in errors
-    accepted = "kv_cache, n_action_steps, n_action_samples, sample_noise_std, temperature, flow_solver, flow_steps"
+    accepted = "n_action_steps, n_action_samples, sample_noise_std, temperature, kv_cache, flow_steps, flow_solver"
     assert f"--acting: speed: no way of acting; accepted are {accepted}." in errors
 
 

@@ -4,6 +4,7 @@ import pytest
 import torch as th
 from torch import nn
 
+from sb3_dtfm.callbacks import flow_paths
 from sb3_dtfm.heads import FlowHead, RegressionHead
 from sb3_dtfm.heads.flow import in_turn, interpolate
 from sb3_dtfm.networks.solvers import SOLVERS
@@ -88,11 +89,11 @@ def test_paths_lead_from_the_noise_to_the_actions(prediction):
     nn.init.normal_(head.vector_field.output.weight)
     hidden, noise = th.randn(5, 4), th.randn(5, 2)
     with th.no_grad():
-        paths = head.paths(hidden, noise, 9)
+        paths = flow_paths(head, hidden, noise, 9)
         assert paths.shape == (10, 5, 2)
         assert paths[0].equal(noise)
         assert paths[-1].equal(head(hidden, noise))
-        th.testing.assert_close(paths[:2], head.paths(hidden, noise, 9)[:2])
+        th.testing.assert_close(paths[:2], flow_paths(head, hidden, noise, 9)[:2])
         assert not head.vector_field._forward_pre_hooks, "nothing stays behind"
 
 

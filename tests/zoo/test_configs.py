@@ -26,6 +26,8 @@ TARGETS = {
     "robosuite/Can-v0": 1,
     "robosuite/Square-v0": 1,
 }
+NOT_SEARCHED = {"flow_solver", "one_step_policy", "return_scaling", "return_conditioning", "regression_coef"}
+NOT_SEARCHED |= {"expected_return_steps"}
 HEAD_KEYS = set(FlowHead.options_class.defaults())
 SETTINGS = [None, "paper"]
 
@@ -136,9 +138,7 @@ def test_a_search_can_find_the_packaged_settings(algo, settings):
     defaults.update({**PolicyOptions.defaults(), **policy.head_class.options_class.defaults()})
     for hyperparams in load(algo, settings).values():
         policy_kwargs = copy.copy(hyperparams.get("policy_kwargs", {}))
-        for key in {"flow_solver", "one_step_policy", "return_scaling", "return_conditioning", "regression_coef"} & set(
-            policy_kwargs
-        ):  # not searched for
+        for key in NOT_SEARCHED & set(policy_kwargs):
             del policy_kwargs[key]
         packaged = {**defaults, "batch_size": 256, **hyperparams, **policy_kwargs}  # which the data decide by default
         powers = {f"{key}_pow": int(np.log2(value)) for key, value in packaged.items() if type(value) is int and value > 0}

@@ -20,7 +20,7 @@ TRAIN = [
     (["--device", "evil"], "--device evil: expected auto, cpu, cuda or cuda:N"),
     (["--target-return", "nan"], "--target-return: target_return must be a finite number"),
     (["--target-return=-1e300"], "got -1e+300. `sb3-dtfm inspect DATASET` suggests one"),
-    (["--dataset-fraction", "nan"], "--dataset-fraction: dataset_fraction must be a number in (0, 1], got nan"),
+    (["--dataset-fraction", "nan"], "--dataset-fraction must be a number in (0, 1], got nan"),
     (["--gym-packages", "absent_tasks"], "--gym-packages absent_tasks: No module named 'absent_tasks'"),
     (["--env-kwargs", "a:float32"], "text needs quotes of its own: \"a:'float32'\""),
 ]

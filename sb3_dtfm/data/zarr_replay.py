@@ -1,0 +1,167 @@
+"""Reading the zarr replay buffers of Diffusion Policy (Chi et al., 2023) into a `TrajectoryBuffer`."""
+
+import contextlib
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_dtfm.actions import ActionSpace
+from sb3_dtfm.data.buffer import TrajectoryBuffer
+from sb3_dtfm.data.cache import Fingerprint, files_below
+from sb3_dtfm.data.flat import (
+    ACTIONS,
+    OBSERVATIONS,
+    bounded_space,
+    explain_range,
+    fitted,
+    json_options,
+    warn_of_made_up_rewards,
+)
+from sb3_dtfm.data.observations import observed
+from sb3_dtfm.data.storage import FileStorage
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory, wrap_dataset_errors
+
+SUFFIXES = (".zarr", ".zarr.zip")
+EXPECTED = "the path of a zarr replay buffer (.zarr, .zarr.zip)"
+ENDS = "meta/episode_ends"
+# A part of an array's columns: "state[:2]".
+COLUMNS = re.compile(r"(.+)\[(\d*):(\d*)\]")
+
+
+def is_zarr(dataset: Any) -> bool:
+    """Whether this is such a path, by its name."""
+    return isinstance(dataset, str | os.PathLike) and os.fspath(dataset).rstrip("/").endswith(SUFFIXES)
+
+
+def fingerprint_zarr(path: str | os.PathLike[str], options: dict[str, Any]) -> Fingerprint:
+    """
+    As it is now.
+
+    :param path: the folder or zip
+    :param options: of :func:`load_zarr`
+    :raises DatasetError: there is none
+    """
+    path = _existing(path)
+    return Fingerprint.of(path.name, path, json_options(options))
+
+
+def _existing(path: str | os.PathLike[str]) -> Path:
+    path = Path(path).expanduser()
+    if not path.exists():
+        raise DatasetError(f"{path}: does not exist; {EXPECTED} is expected.")
+    return path
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The group at its top, while it is read."""
+    try:
+        import zarr
+    except ImportError as error:
+        raise ImportError(f'{path} needs zarr: pip install "sb3-dtfm[zarr]"') from error
+    if path.is_dir():
+        files_below(path)  # no link leads out of it
+        yield zarr.open_group(path, mode="r")
+        return
+    with zarr.storage.ZipStore(path, mode="r") as store:
+        yield zarr.open_group(store, mode="r")
+
+
+def load_zarr(
+    path: str | os.PathLike[str],
+    observation_keys: Sequence[str] | Mapping[str, str] | None = None,
+    action_bounds: Sequence[Any] | None = None,
+    clip_actions: bool = False,
+    action_space: ActionSpace | None = None,
+    observation_space: spaces.Space | None = None,
+    on_invalid: str = "raise",
+    storage: FileStorage | None = None,
+) -> TrajectoryBuffer:
+    """
+    A folder, or a zip, of `data/action` (N, A), of images (N, height, width, channels) and vectors (N, .) in `data`, and of
+    `meta/episode_ends` (E,). Images of floats with whole numbers from 0 to 255 become bytes. Episodes are read one by one.
+
+    There are no rewards: an episode counts as a success, with a reward of 1 at its last step.
+
+    :param path: of the folder or zip
+    :param observation_keys: which arrays of `data` make up the observation; or what the environment calls each of them, with
+        some of its columns: `{"pixels": "img", "agent_pos": "state[:2]"}`. By default all images, and `state` or `obs`
+    :param action_bounds: see :func:`~sb3_dtfm.data.load_flat`
+    :param clip_actions: see :func:`~sb3_dtfm.data.load_flat`
+    :param action_space: see :func:`~sb3_dtfm.data.load_flat`
+    :param observation_space: the environment's
+    :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
+    :param storage: where the steps go, memory if not given
+    :raises ImportError: `sb3-dtfm[zarr]` is not installed
+    :raises DatasetError: none such, damaged, arrays missing or of lengths that do not fit together, NaN or infinity, or
+        actions out of bounds; names array, episode and step
+    """
+    path = _existing(path)
+    source = str(path)
+    with wrap_dataset_errors(source), _opened(path) as group:
+        data = dict(group["data"].arrays())
+        if ENDS not in group:
+            raise DatasetError(f"{source}: has no {ENDS}, which says where episodes end.")
+        ends = np.asarray(group[ENDS][:])
+        name = next((each for each in ACTIONS if each in data), None)
+        if name is None:
+            raise DatasetError(f"{source}: data has no array one of {', '.join(ACTIONS)}, only {', '.join(sorted(data))}.")
+        n_steps = data[name].shape[0]
+        if ends.ndim != 1 or not len(ends) or (np.diff(ends, prepend=0) <= 0).any() or ends[-1] != n_steps:
+            raise DatasetError(f"{source}: {ENDS} is {ends}, expected ascending numbers of steps, the last one {n_steps}.")
+        chosen = _chosen(data, observation_keys, name, n_steps, source)
+        warn_of_made_up_rewards((), source)
+        space = bounded_space(action_bounds, action_space, np.asarray(data[name][: ends[0]]), source)
+
+        def trajectory(number: int) -> Trajectory:
+            steps, where = slice(int(ends[number - 1]) if number else 0, int(ends[number])), f"episode {number}"
+            entries = {each: _read(data[array], steps, columns, f"{source}, {where}: {array}") for each, (array, columns)
+                       in chosen.items()}  # fmt: skip
+            seen = observed(entries, list(entries), observation_space, f"{source}, {where}")
+            length = steps.stop - steps.start
+            actions = fitted(np.asarray(data[name][steps]), space, clip_actions)
+            rewards = np.eye(1, length, length - 1)[0]
+            return Trajectory(seen.vectors, actions, rewards, terminated=True, name=where, images=seen.images)
+
+        with explain_range(space, action_bounds, action_space):
+            return TrajectoryBuffer.from_trajectories(
+                map(trajectory, range(len(ends))), space, n_steps=n_steps, source=source, storage=storage,
+                on_invalid=on_invalid,
+            )  # fmt: skip
+
+
+def _chosen(
+    data: Mapping[str, Any], keys: Sequence[str] | Mapping[str, str] | None, actions: str, n_steps: int, source: str
+) -> dict[str, tuple[str, slice]]:
+    """The array and its columns of each entry of the observation."""
+    if keys is None:
+        images = [name for name, array in data.items() if len(array.shape) == 4]
+        vectors = [name for name in OBSERVATIONS if name in data][:1]
+        keys = [*images, *vectors] or [name for name in data if name != actions]
+    found = {}
+    for name, wanted in keys.items() if isinstance(keys, Mapping) else ((key, key) for key in keys):
+        parts = COLUMNS.fullmatch(wanted)
+        array = parts[1] if parts else wanted
+        if array not in data:
+            raise DatasetError(f"{source}: data has no array {array!r}, only {', '.join(sorted(data))}.")
+        if data[array].shape[0] != n_steps:
+            raise DatasetError(f"{source}: {array} has shape {data[array].shape}, expected {n_steps} steps.")
+        columns = slice(*(int(number) if number else None for number in parts.groups()[1:])) if parts else slice(None)
+        found[name] = (array, columns)
+    return found
+
+
+def _read(array: Any, steps: slice, columns: slice, where: str) -> np.ndarray:
+    """An episode of an array; images as bytes."""
+    values = np.asarray(array[steps])
+    if values.ndim != 4 or values.dtype == np.uint8:
+        return values if columns == slice(None) else values.reshape(len(values), -1)[:, columns]
+    images = values.astype(np.uint8)
+    if not (images == values).all():
+        raise DatasetError(f"{where} holds images of {values.dtype} that are no whole numbers from 0 to 255.")
+    return images

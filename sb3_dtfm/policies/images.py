@@ -1,0 +1,186 @@
+"""Images become features: one extractor of Stable-Baselines3 for each camera, a small residual network by default."""
+
+import itertools
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
+from torch import nn
+from torch.nn import functional as F
+
+# Groups of a group normalisation have so many channels.
+GROUP = 8
+
+
+class ResidualExtractor(BaseFeaturesExtractor):
+    """
+    A residual network with group normalisation and spatial softmax (Levine et al., 2016), which learns where things are on
+    random crops, as in robomimic (Mandlekar et al., 2021) and Diffusion Policy (Chi et al., 2023). Acting crops the centre.
+
+    :param observation_space: Box (channels, height, width)
+    :param features_dim: numbers that an image becomes
+    :param channels: of the first convolution and of each residual block; all but the last block halve height and width
+    :param crop: share of height and of width that is kept; 1 keeps all
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        features_dim: int = 64,
+        channels: tuple[int, ...] = (32, 32, 64, 64),
+        crop: float = 0.9,
+    ) -> None:
+        super().__init__(observation_space, features_dim)
+        n_channels, height, width = observation_space.shape
+        self.size = (round(crop * height), round(crop * width))
+        self.stem = nn.Conv2d(n_channels, channels[0], kernel_size=5, stride=2, padding=2)
+        *pairs, last = itertools.pairwise(channels)
+        blocks = [ResidualBlock(*pair, stride=2) for pair in pairs]
+        self.blocks = nn.Sequential(*blocks, ResidualBlock(*last, stride=1))
+        self.linear = nn.Linear(2 * channels[-1], features_dim)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """From (N, channels, height, width) to (N, features_dim)."""
+        maps = self.blocks(F.relu(self.stem(self._crop(observations))))
+        return self.linear(spatial_softmax(maps))
+
+    def _crop(self, images: th.Tensor) -> th.Tensor:
+        """A random part of each image while training, the centre of all otherwise."""
+        (height, width), room = self.size, (images.shape[2] - self.size[0], images.shape[3] - self.size[1])
+        if not self.training:
+            first, second = room[0] // 2, room[1] // 2
+            return images[:, :, first : first + height, second : second + width]
+        device = images.device
+        top, left = (th.randint(each + 1, (len(images), 1), device=device) for each in room)
+        rows, columns = top + th.arange(height, device=device), left + th.arange(width, device=device)
+        numbers = th.arange(len(images), device=device)[:, None, None]
+        return images[numbers, :, rows[:, :, None], columns[:, None, :]].movedim(3, 1)
+
+
+class ResidualBlock(nn.Module):
+    """
+    Two convolutions beside a shortcut (He et al., 2016), with group normalisation (Wu and He, 2018).
+
+    :param n_in: channels that come in
+    :param n_out: channels that go out
+    :param stride: of the first convolution
+    """
+
+    def __init__(self, n_in: int, n_out: int, stride: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(n_in, n_out, kernel_size=3, stride=stride, padding=1, bias=False)
+        self.first_norm = nn.GroupNorm(n_out // GROUP, n_out)
+        self.second = nn.Conv2d(n_out, n_out, kernel_size=3, padding=1, bias=False)
+        self.second_norm = nn.GroupNorm(n_out // GROUP, n_out)
+        same = n_in == n_out and stride == 1
+        self.shortcut = nn.Identity() if same else nn.Conv2d(n_in, n_out, kernel_size=1, stride=stride, bias=False)
+
+    def forward(self, maps: th.Tensor) -> th.Tensor:
+        """From (N, n_in, height, width) to (N, n_out, height / stride, width / stride)."""
+        inner = F.relu(self.first_norm(self.first(maps)))
+        return F.relu(self.shortcut(maps) + self.second_norm(self.second(inner)))
+
+
+def spatial_softmax(maps: th.Tensor) -> th.Tensor:
+    """
+    Where each channel is largest: the mean position under its softmax.
+
+    :param maps: (N, C, height, width)
+    :return: (N, 2 C) in [-1, 1], the rows of all channels, then the columns
+    """
+    weights = maps.flatten(2).softmax(dim=-1).view_as(maps)
+    rows, columns = (th.linspace(-1.0, 1.0, n, device=maps.device) for n in maps.shape[2:])
+    return th.cat(((weights.sum(dim=3) * rows).sum(dim=2), (weights.sum(dim=2) * columns).sum(dim=2)), dim=1)
+
+
+# By the name that `features_extractor_class` and saved models have; a user's own class is entered here before loading.
+EXTRACTORS: dict[str, type[BaseFeaturesExtractor]] = {each.__name__: each for each in (ResidualExtractor, NatureCNN)}
+
+
+class ImageEncoder(nn.Module):
+    """
+    The features of all cameras side by side, each normalised over its own (Ba et al., 2016).
+
+    :param image_spaces: Box (channels, height, width) uint8 by camera
+    :param extractor: a key of `EXTRACTORS`
+    :param extractor_kwargs: of that class
+    :param normalize_images: divide by 255, as SB3 does
+    :param shared: one extractor for all cameras, whose images have the same shape
+    :ivar features_dim: F
+    """
+
+    def __init__(
+        self,
+        image_spaces: Mapping[str, spaces.Box],
+        extractor: str,
+        extractor_kwargs: Mapping[str, Any],
+        normalize_images: bool,
+        shared: bool,
+    ) -> None:
+        super().__init__()
+        self.cameras = sorted(image_spaces)
+        self.normalize_images = normalize_images
+        shapes = {space.shape for space in image_spaces.values()}
+        if shared and len(shapes) > 1:
+            raise ValueError(f"share_features_extractor=True needs images of one shape, got {sorted(shapes)}.")
+        made = self.cameras[:1] if shared else self.cameras
+        self.extractors = nn.ModuleList(EXTRACTORS[extractor](image_spaces[each], **extractor_kwargs) for each in made)
+        self.norms = nn.ModuleList(nn.LayerNorm(self._extractor(i).features_dim) for i in range(len(self.cameras)))
+        self.features_dim = sum(self._extractor(i).features_dim for i in range(len(self.cameras)))
+
+    def _extractor(self, number: int) -> Any:
+        return self.extractors[min(number, len(self.extractors) - 1)]
+
+    def forward(self, images: Mapping[str, th.Tensor]) -> th.Tensor:
+        """
+        :param images: (..., channels, height, width) uint8 by camera
+        :return: (..., F)
+        """
+        features = []
+        for number, (camera, norm) in enumerate(zip(self.cameras, self.norms, strict=True)):
+            flat = images[camera].flatten(end_dim=-4)
+            pixels = flat.float() / 255.0 if self.normalize_images else flat.float()
+            found = norm(self._extractor(number)(pixels))
+            features.append(found.unflatten(0, images[camera].shape[:-3]))
+        return th.cat(features, dim=-1)
+
+
+def image_spaces(observation_space: spaces.Dict) -> dict[str, spaces.Box]:
+    """The images among observations, by camera."""
+    found = {}
+    for name, space in observation_space.spaces.items():
+        if isinstance(space, spaces.Box) and is_image_space(space, check_channels=False):
+            found[name] = space
+    return found
+
+
+def unpack_images(observation: Mapping[str, Any], expected: Mapping[str, spaces.Box], n_rows: int) -> dict[str, np.ndarray]:
+    """
+    The images of an observation, channels first.
+
+    :param observation: of a `ReturnToGoWrapper`, images (B, ...) or of one environment
+    :param expected: Box (channels, height, width) by camera
+    :param n_rows: B
+    :return: (B, channels, height, width) uint8 by camera
+    :raises ValueError: a camera is missing, or its image is another one than the model's
+    """
+    images = {}
+    for camera, space in expected.items():
+        if camera not in observation:
+            raise ValueError(f"observation has no image {camera!r}, which the model sees; got {', '.join(observation)}.")
+        image = np.asarray(observation[camera])
+        image = image[None] if image.ndim == 3 else image
+        channels, height, width = space.shape
+        if image.shape[1:] == (height, width, channels) and image.shape[1:] != space.shape:
+            image = np.moveaxis(image, 3, 1)
+        if image.dtype != np.uint8 or image.shape != (n_rows, *space.shape):
+            raise ValueError(
+                f"observation[{camera!r}] is {image.dtype} of shape {image.shape}; uint8 of "
+                f"({n_rows}, {channels}, {height}, {width}) or ({n_rows}, {height}, {width}, {channels}) is expected."
+            )
+        images[camera] = image
+    return images

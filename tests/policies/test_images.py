@@ -1,0 +1,215 @@
+"""Images beside numbers: learned from as bytes, encoded once, and seen alike in data, environments and exported files."""
+
+import json
+import zlib
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.torch_layers import NatureCNN
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_dtfm import DT, DTFM
+from sb3_dtfm.data import DatasetError, load_dataset
+from sb3_dtfm.envs import ReturnToGoWrapper
+from sb3_dtfm.policies.images import EXTRACTORS, ResidualExtractor, spatial_softmax
+from tests.algorithms.small import make_model
+from tests.images import CAMERA, make_pixels, record
+
+SMALL = dict(features_extractor_kwargs=dict(channels=(8, 8, 8), features_dim=8))
+BOUNDS = dict(action_bounds=(-2, 2))
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    pytest.importorskip("pygame")
+    return record(4)
+
+
+@pytest.fixture(scope="module")
+def buffer(episodes):
+    return load_dataset(episodes, **BOUNDS)
+
+
+def make(algorithm, buffer, **kwargs):
+    policy_kwargs = {**SMALL, **kwargs.pop("policy_kwargs", {})}
+    return make_model(algorithm, buffer, context_length=3, policy_kwargs=policy_kwargs, **kwargs)
+
+
+def wrapped():
+    return ReturnToGoWrapper(make_pixels(), target_return=-100.0)
+
+
+@pytest.mark.parametrize("algorithm", [DT, DTFM])
+def test_a_model_of_images_learns_acts_and_comes_back(algorithm, buffer, tmp_path):
+    model = make(algorithm, buffer, ema_decay=0.9).learn(3)
+    env = make_vec_env(wrapped, 2)
+    model.set_env(env)
+    observation = model.get_env().reset()
+    assert observation[CAMERA].shape == (2, 3, 32, 32), "channels first, by SB3"
+    model.save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model", env)
+    actions = [each.predict(observation, deterministic=True)[0] for each in (model, loaded)]
+    np.testing.assert_array_equal(*actions)
+    returns, _ = evaluate_policy(loaded, env, 2, deterministic=True, return_episode_rewards=True)
+    assert np.isfinite(returns).all()
+
+
+def test_the_picture_decides_and_its_channels_may_come_first_or_last(buffer):
+    model = make(DTFM, buffer, policy_kwargs=dict(regression_coef=1.0, flow_steps=0)).learn(2)
+    observation, _ = wrapped().reset(seed=0)
+    seen = model.policy.predict(observation, deterministic=True)[0]
+    first = {**observation, CAMERA: np.moveaxis(observation[CAMERA], 2, 0)}
+    model.policy.reset()
+    np.testing.assert_array_equal(model.policy.predict(first, deterministic=True)[0], seen)
+    model.policy.reset()
+    black = {**observation, CAMERA: np.zeros_like(observation[CAMERA])}
+    assert not np.array_equal(model.policy.predict(black, deterministic=True)[0], seen)
+
+
+def test_a_frame_is_encoded_once(buffer, monkeypatch):
+    """The context holds its features."""
+    model = make(DT, buffer)
+    env, n_frames = wrapped(), []
+    encoder = model.policy.acting_network.encoder
+    forward = encoder.forward
+    monkeypatch.setattr(encoder, "forward", lambda images: n_frames.append(len(images[CAMERA])) or forward(images))
+    observation, _ = env.reset(seed=0)
+    state, start = None, np.array([True])
+    for _ in range(5):
+        action, state = model.policy.predict(observation, state, start, deterministic=True)
+        observation, *_ = env.step(action)
+        start = np.array([False])
+    assert n_frames == [1] * 5
+    assert state.observations.shape == (1, 3, 3 + 8)
+    assert not any(array.dtype == np.uint8 for array in state)
+
+
+def test_windows_hold_the_bytes_of_each_step(buffer, episodes):
+    batch = buffer.windows(th.tensor([0, 25]), 3)
+    images = batch.observations[CAMERA]
+    assert (images.shape, images.dtype) == ((2, 3, 3, 32, 32), th.uint8)
+    for back in range(3):
+        recorded = np.moveaxis(episodes[1][5 - back][0][CAMERA], 2, 0)
+        np.testing.assert_array_equal(images[1, -1 - back].numpy(), recorded)
+    assert buffer.own(CAMERA).shape == (80, 32, 32, 3), "each frame once"
+
+
+def test_files_and_caches_hold_the_images(buffer, tmp_path):
+    buffer.save(tmp_path / "pixels.npz")
+    read = load_dataset(tmp_path / "pixels.npz")
+    cached = load_dataset(tmp_path / "pixels.npz", cache_dir=tmp_path / "cache")
+    for each in (read, cached, load_dataset([{"dataset": read}])):
+        assert th.equal(each.own(CAMERA), buffer.own(CAMERA))
+        assert each.image_spaces == buffer.image_spaces
+    assert cached.memory_mapped
+    half = buffer.select(np.array([2, 0]))
+    assert th.equal(half.own(CAMERA)[:20], buffer.own(CAMERA)[40:60])
+
+
+def test_images_alone_are_enough(tmp_path):
+    pytest.importorskip("pygame")
+    alone = load_dataset(record(2, numbers=False), **BOUNDS)
+    model = DTFM("CnnPolicy", dataset=alone, batch_size=8, policy_kwargs=SMALL, seed=0).learn(2)
+    env = ReturnToGoWrapper(make_pixels(numbers=False), target_return=-100.0)
+    model.set_env(env)
+    assert np.isfinite(model.predict(model.get_env().reset())[0]).all()
+
+
+def test_sb3s_own_network_and_one_for_all_cameras(episodes):
+    two = [[({**seen, "other": seen[CAMERA][:, ::-1]}, *rest) for seen, *rest in steps] for steps in episodes]
+    for step in (step for steps in two for step in steps):
+        step[0]["other"] = step[0]["other"].repeat(2, axis=0).repeat(2, axis=1)
+        step[0][CAMERA] = step[0][CAMERA].repeat(2, axis=0).repeat(2, axis=1)  # NatureCNN needs 36 pixels
+    data = load_dataset(two, **BOUNDS)
+    kwargs = dict(features_extractor_class=NatureCNN, features_extractor_kwargs=dict(features_dim=16))
+    model = make_model(DT, data, policy_kwargs=kwargs).learn(1)
+    assert [type(each) for each in model.policy.network.encoder.extractors] == [NatureCNN, NatureCNN]
+    shared = make_model(DT, data, policy_kwargs={**kwargs, "share_features_extractor": True}).learn(1)
+    assert len(shared.policy.network.encoder.extractors) == 1
+    assert shared.policy.observation_dim == model.policy.observation_dim == 3 + 2 * 16
+
+
+def test_a_critic_values_what_images_show(buffer):
+    model = make(DTFM, buffer, policy_kwargs=dict(critic_steps=1, n_action_samples=2)).learn(2)
+    observation, _ = wrapped().reset(seed=0)
+    assert np.isfinite(model.policy.predict(observation, deterministic=True)[0]).all()
+
+
+def test_the_exported_file_acts_alike(buffer, tmp_path):
+    ort = pytest.importorskip("onnxruntime")
+    model = make(DTFM, buffer).learn(2)
+    model.export(tmp_path / "policy.onnx")
+    session = ort.InferenceSession(str(tmp_path / "policy.onnx"), providers=["CPUExecutionProvider"])
+    assert json.loads(session.get_modelmeta().custom_metadata_map["sb3_dtfm"])["images"] == {CAMERA: [3, 32, 32]}
+    types = {"tensor(float)": np.float32, "tensor(int64)": np.int64, "tensor(bool)": bool, "tensor(uint8)": np.uint8}
+    inputs = {each.name: np.zeros((1, *each.shape[1:]), types[each.type]) for each in session.get_inputs()}
+    env = DummyVecEnv([wrapped])
+    env.seed(0)
+    observation, state, start = env.reset(), None, np.array([True])
+    for timestep in range(5):
+        image = np.moveaxis(observation[CAMERA], 3, 1)
+        if timestep == 0:
+            inputs["episode_keys"][0] = zlib.crc32(image[0].tobytes(), zlib.crc32(observation["observation"][0] + 0.0))
+        newest = {"observations": observation["observation"], "returns_to_go": observation["return_to_go"][:, 0]}
+        for name, value in {**newest, "timesteps": timestep, "mask": True, "actions": 0.0}.items():
+            inputs[name] = np.roll(inputs[name], -1, axis=1)
+            inputs[name][:, -1] = value
+        inputs[CAMERA] = image
+        chunk, inputs["features"] = session.run(None, inputs)
+        action, state = model.policy.predict(observation, state, start, deterministic=True)
+        np.testing.assert_allclose(chunk[:, 0], action, atol=1e-4)
+        inputs["actions"][:, -1] = action
+        observation, *_ = env.step(action)
+        start = np.array([False])
+
+
+def test_training_crops_at_random_and_acting_in_the_centre():
+    extractor = ResidualExtractor(spaces.Box(0, 255, (3, 40, 60), np.uint8), crop=0.5)
+    images = th.arange(40 * 60).view(1, 1, 40, 60).expand(64, 3, -1, -1).float()
+    centre = extractor.eval()._crop(images)
+    assert th.equal(centre[0, 0], images[0, 0, 10:30, 15:45])
+    crops = extractor.train()._crop(images)
+    assert crops.shape == (64, 3, 20, 30)
+    assert len({float(each[0, 0, 0]) for each in crops}) > 30
+    assert th.equal(crops - crops[:, :, :1, :1], (centre - centre[:, :, :1, :1]))
+
+
+def test_spatial_softmax_finds_the_place():
+    maps = th.zeros(1, 2, 5, 9)
+    maps[0, 0, 0, 8] = maps[0, 1, 2, 4] = 100.0
+    th.testing.assert_close(spatial_softmax(maps), th.tensor([[-1.0, 0.0, 1.0, 0.0]]))
+
+
+def change(episodes, make_image):
+    return [[({**seen, CAMERA: make_image(seen[CAMERA])}, *rest) for seen, *rest in steps] for steps in episodes]
+
+
+def test_unfit_images_are_refused(episodes, buffer):
+    with pytest.raises(DatasetError, match=r"float32 of shape \(20, 32, 32, 3\).*write \(255 \* images\)"):
+        load_dataset(change(episodes, lambda image: image.astype(np.float32) / 255), **BOUNDS)
+    with pytest.raises(
+        DatasetError, match=r"episode 3: images of 'pixels' have shape \(16, 32, 3\), and those .*\(32, 32, 3\)"
+    ):
+        load_dataset([*episodes[:3], *change(episodes[3:], lambda image: image[::2])], **BOUNDS)
+    with pytest.raises(DatasetError, match="expected 1, 3 or 4 channels, first or last"):
+        load_dataset(change(episodes, lambda image: np.concatenate([image, image], axis=2)), **BOUNDS)
+    with pytest.raises(DatasetError, match=r"images \{'pixels': \(3, 32, 32\)\}, the environment's are of no camera"):
+        make(DT, buffer, env=ReturnToGoWrapper(record_env_without_images(), target_return=0.0))
+    model = make(DT, buffer)
+    observation, _ = wrapped().reset(seed=0)
+    with pytest.raises(ValueError, match="no image 'pixels', which the model sees"):
+        model.policy.predict({name: each for name, each in observation.items() if name != CAMERA})
+    with pytest.raises(ValueError, match=r"uint8 of shape \(1, 16, 32, 3\); uint8 of \(1, 3, 32, 32\) or \(1, 32, 32, 3\)"):
+        model.policy.predict({**observation, CAMERA: observation[CAMERA][::2]})
+    with pytest.raises(ValueError, match=f"features_extractor_class must be one of {', '.join(EXTRACTORS)}"):
+        make(DT, buffer, policy_kwargs=dict(features_extractor_class="ResNet"))
+
+
+def record_env_without_images():
+    import gymnasium as gym
+
+    return gym.make("Pendulum-v1")
