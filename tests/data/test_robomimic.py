@@ -366,3 +366,23 @@ def test_broken_env_args_are_named(path):
     with h5py.File(path, "a") as file:
         file["data"].attrs["env_args"] = "{"
     assert "'env_args' of group 'data' is not JSON" in refused(path)
+
+
+def test_cameras_are_chosen_beside_numbers(tmp_path):
+    """As robomimic's image files hold them, a camera an entry of `obs`."""
+    rng = np.random.default_rng(0)
+    images = [rng.integers(0, 256, (n, 6, 8, 3), dtype=np.uint8) for n in (3, 4)]
+    with h5py.File(tmp_path / "image.hdf5", "w") as file:
+        for i, array in enumerate(images):
+            demo = file.create_group(f"data/demo_{i}")
+            demo["actions"], demo["obs/agentview_image"] = np.zeros((len(array), 2)), array
+            demo["obs/robot0_eef_pos"] = rng.normal(size=(len(array), 3))
+            demo["rewards"], demo["dones"] = np.eye(1, len(array), len(array) - 1)[0], np.zeros(len(array))
+    buffer = load_robomimic(tmp_path / "image.hdf5", observation_keys=["agentview_image", "robot0_eef_pos"])
+    np.testing.assert_array_equal(buffer.own("agentview_image").numpy(), np.concatenate(images))
+    assert buffer.observations.shape == (7, 3)
+    with h5py.File(tmp_path / "image.hdf5", "a") as file:
+        del file["data/demo_1/obs/agentview_image"]
+        file["data/demo_1/obs/agentview_image"] = images[1].astype(np.float32) / 255
+    with pytest.raises(DatasetError, match=r"demo_1: observation 'agentview_image' is float32 .*uint8 images \(4, height"):
+        load_robomimic(tmp_path / "image.hdf5", observation_keys=["agentview_image", "robot0_eef_pos"])

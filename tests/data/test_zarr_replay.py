@@ -1,0 +1,95 @@
+"""The zarr replay buffers of Diffusion Policy: folders and zips, images of bytes or of whole floats, and what is refused."""
+
+import shutil
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from sb3_dtfm.data import DatasetError, load_dataset
+
+zarr = pytest.importorskip("zarr")
+
+ENDS = [3, 8]
+N = 8
+
+
+@pytest.fixture
+def arrays():
+    rng = np.random.default_rng(0)
+    return {
+        "data/img": rng.integers(0, 256, (N, 8, 8, 3)).astype(np.float32),
+        "data/state": rng.uniform(0, 512, (N, 5)).astype(np.float32),
+        "data/action": rng.uniform(0, 512, (N, 2)).astype(np.float32),
+        "meta/episode_ends": np.array(ENDS),
+    }
+
+
+def write(path, arrays):
+    """Format 2, as it was published."""
+    root = zarr.open_group(str(path), mode="w", **({"zarr_format": 2} if int(zarr.__version__[0]) > 2 else {}))
+    for name, array in arrays.items():
+        group, _, member = name.partition("/")
+        root.require_group(group)[member] = array
+    return path
+
+
+def load(path, **kwargs):
+    with pytest.warns(UserWarning, match="every episode counts as one"):
+        return load_dataset(path, action_bounds=(0, 512), **kwargs)
+
+
+def test_a_folder_and_a_zip_hold_the_same_episodes(arrays, tmp_path):
+    folder = write(tmp_path / "push.zarr", arrays)
+    shutil.make_archive(str(folder), "zip", folder)
+    for path in (folder, tmp_path / "push.zarr.zip"):
+        buffer = load(path)
+        assert buffer.episode_lengths.tolist() == [3, 5]
+        np.testing.assert_array_equal(buffer.observations.numpy(), arrays["data/state"])
+        np.testing.assert_array_equal(buffer.actions.numpy(), arrays["data/action"])
+        np.testing.assert_array_equal(buffer.own("img").numpy(), arrays["data/img"].astype(np.uint8))
+        assert buffer.rewards.tolist() == [0, 0, 1, 0, 0, 0, 0, 1]
+        assert buffer.terminated.all()
+
+
+def test_the_environments_names_and_some_columns(arrays, tmp_path):
+    path = write(tmp_path / "push.zarr", arrays)
+    buffer = load(path, observation_keys={"pixels": "img", "agent_pos": "state[:2]"}, cache_dir=tmp_path / "cache")
+    assert buffer.image_spaces == {"pixels": spaces.Box(0, 255, (8, 8, 3), np.uint8)}
+    np.testing.assert_array_equal(buffer.observations.numpy(), arrays["data/state"][:, :2])
+    alone = load(path, observation_keys=["img"])
+    assert (alone.observations == 0).all()
+
+
+REFUSED = {
+    "no ends": (lambda arrays: arrays.pop("meta/episode_ends"), r"has no meta/episode_ends"),
+    "ends": (lambda arrays: arrays.update({"meta/episode_ends": np.array([3, 9])}), r"ascending .*, the last one 8"),
+    "no actions": (
+        lambda arrays: arrays.pop("data/action"),
+        r"data has no array one of actions, .*, only img, state",
+    ),
+    "steps": (lambda arrays: arrays.update({"data/state": np.zeros((4, 5))}), r"state has shape \(4, 5\), expected 8 steps"),
+    "half a pixel": (
+        lambda arrays: arrays["data/img"].__setitem__(0, 0.5),
+        r"episode 0: img holds images of float32",
+    ),
+    "NaN": (lambda arrays: arrays["data/state"].__setitem__(4, np.nan), r"episode 1, step 1"),
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*every episode counts")
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_does_not_fit_is_refused_by_name(name, arrays, tmp_path):
+    spoil, message = REFUSED[name]
+    arrays = {key: array.copy() for key, array in arrays.items()}
+    spoil(arrays)
+    with pytest.raises(DatasetError, match=message):
+        load_dataset(write(tmp_path / "push.zarr", arrays), action_bounds=(0, 512))
+
+
+def test_what_is_not_there_or_no_zarr_is_refused(tmp_path):
+    with pytest.raises(DatasetError, match=r"missing\.zarr: does not exist; the path of a zarr replay buffer"):
+        load_dataset(tmp_path / "missing.zarr")
+    (tmp_path / "broken.zarr.zip").write_bytes(b"PK no zip")
+    with pytest.raises(DatasetError, match=r"broken\.zarr\.zip: cannot be read"):
+        load_dataset(tmp_path / "broken.zarr.zip")
