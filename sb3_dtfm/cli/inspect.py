@@ -156,12 +156,11 @@ def loading(dataset: str | list[str], options: dict[str, Any], env_id: str | Non
     :param env_id: as for :func:`load`
     :return: Python that reads the dataset
     """
-    given = [f"{name}={value!r}" for name, value in options.items()]
-    known = []
+    given = {name: repr(value) for name, value in options.items()}
     if env_id is not None:
         limit = gym.spec(env_id).max_episode_steps
-        known = [f"action_space=gymnasium.make({env_id!r}).action_space", f"max_episode_steps={limit}"]
-    return f"sb3_dtfm.data.load_dataset({', '.join([repr(dataset), *known, *given])})"
+        given = {"action_space": f"gymnasium.make({env_id!r}).action_space", "max_episode_steps": repr(limit), **given}
+    return f"sb3_dtfm.data.load_dataset({', '.join([repr(dataset), *map('='.join, given.items())])})"
 
 
 def _actions(buffer: TrajectoryBuffer, found: Inspection) -> str:

@@ -148,6 +148,12 @@ def test_the_environment_tells_of_the_range_of_actions(workplace, capsys):
     loading = text.split("To load it in Python:\n")[1].splitlines()[0]
     buffer = eval(loading, {"gymnasium": gymnasium, "sb3_dtfm": sb3_dtfm})
     assert (buffer.action_space.high[0], buffer.n_episodes) == (2.0, 4)
+    shorter = ["--dataset-kwargs", "max_episode_steps:3"]
+    with pytest.warns(UserWarning, match="4 of 4 episodes have more than 3 steps"):
+        assert main(["inspect", "swings.npz", "--env", "Pendulum-v1", *shorter]) == 0
+    loading = capsys.readouterr().out.split("To load it in Python:\n")[1].splitlines()[0]
+    with pytest.warns(UserWarning, match="4 of 4 episodes have more than 3 steps"):
+        assert len(eval(loading, {"gymnasium": gymnasium, "sb3_dtfm": sb3_dtfm})) == 12
 
 
 def test_a_task_of_another_package_is_found(workplace, capsys):
