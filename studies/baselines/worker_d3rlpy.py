@@ -25,7 +25,7 @@ class D3rlpyLearner:
     """
     One of d3rlpy's algorithms.
 
-    :param settings: `algorithm`, one of `CONFIGS`; `hidden` layers, `critic_layer_norm` (of values, too), the actor's `dropout`;
+    :param settings: `algorithm`, one of `CONFIGS`; `hidden` layers, `critic_layer_norm` (of Q and V), the actor's `dropout`;
         `standardize` observations, `reward` scaling; a `cosine` schedule of the actor's learning rate, `adamw` options; and
         fields of the algorithm's configuration
     :param dataset: to learn from
