@@ -73,20 +73,26 @@ def test_a_recording_that_is_stopped_goes_on_with_the_part_that_it_lost(tmp_path
     assert found["n_targets"] == sum(range(7))
 
 
+def in_its_environment(code: str, folder: Path) -> None:
+    environment = {**os.environ, "MUJOCO_GL": "disabled", "PYTHONPATH": str(ROOT / "studies" / "ogbench")}
+    subprocess.run([str(PYTHON), "-c", code], check=True, env=environment, cwd=folder)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not PYTHON.exists(), reason="make ogbench installs it")
-def test_an_episode_depends_on_its_number_alone(tmp_path):
-    """The published sets have these sizes; the arm and the targets of a part are those of the whole recording."""
-    command = (
-        "import sys; import numpy as np; from play import Recorder, save; from pathlib import Path\n"
-        "for task in ('cube-single', 'scene', 'puzzle-3x3', 'cube-double'):\n"
-        "    recorder = Recorder(task, 0)\n"
-        "    for number in (1, 0, 1): arrays = recorder.episode(number); save(Path(f'{task}-{number}.npz'), arrays)\n"
-        "    again = Recorder(task, 0).episode(1)\n"
-        "    assert all(np.array_equal(again[name], arrays[name]) for name in again), task\n"
-    )
-    environment = {**os.environ, "MUJOCO_GL": "disabled", "PYTHONPATH": str(ROOT / "studies" / "ogbench")}
-    subprocess.run([str(PYTHON), "-c", command], check=True, env=environment, cwd=tmp_path)
+def test_episodes_have_the_published_sizes_and_depend_on_their_numbers_alone(tmp_path):
+    code = """
+from pathlib import Path
+import numpy as np
+from play import Recorder, save
+for task in ("cube-single", "scene", "puzzle-3x3", "cube-double"):
+    recorder = Recorder(task, 0)
+    for number in (1, 0):
+        save(Path(f"{task}-{number}.npz"), recorder.episode(number))
+    again = recorder.episode(1)
+    assert all(np.array_equal(again[name], array) for name, array in np.load(f"{task}-1.npz").items()), task
+"""
+    in_its_environment(code, tmp_path)
     for task, size in {"cube-single": 28, "scene": 40, "puzzle-3x3": 55, "cube-double": 37}.items():
         first, second = (load(tmp_path / f"{task}-{number}.npz") for number in (0, 1))
         assert first["observations"].shape == (1001, size)
@@ -95,3 +101,40 @@ def test_an_episode_depends_on_its_number_alone(tmp_path):
         np.testing.assert_array_equal(np.flatnonzero(first["terminals"]), [1000])
         assert first["n_reached"] >= 5
         assert not np.array_equal(first["qpos"], second["qpos"])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not PYTHON.exists(), reason="make ogbench installs it")
+def test_transitions_are_those_of_ogbench_s_own_reader(tmp_path):
+    """Of an episode whose cube stays at the goal of task 1 for a while."""
+    code = """
+import sys
+import gymnasium as gym
+import numpy as np
+from ogbench.relabel_utils import relabel_dataset
+from ogbench.utils import load_dataset
+import play, relabel
+sys.argv = ["play.py", "cube-single", "play.npz", "--episodes", "2"]
+play.main()
+arrays = play.load(play.Path("play.npz"))
+arrays["qpos"][500:600, 14:17] = 0.425, -0.1, 0.02
+play.save(play.Path("play.npz"), arrays)
+sys.argv = ["relabel.py", "cube-single", "play.npz", "--tasks", "1"]
+relabel.main()
+theirs = load_dataset("play.npz", add_info=True)
+env_id = "cube-single-singletask-task1-v0"
+relabel_dataset(env_id, gym.make(env_id), theirs)
+np.savez("theirs.npz", **theirs)
+"""
+    in_its_environment(code, tmp_path)
+    theirs = load(tmp_path / "theirs.npz")
+    buffer = load_dataset(tmp_path / "cube-single-play-task1-v0.npz")
+    rows = th.from_numpy(np.setdiff1d(np.arange(2002), (1000, 2001)))  # theirs leave out the last steps
+    ours = buffer.transitions(rows, 1, 0.5)
+    assert ours.mask.all()
+    for found, name in ((ours.observations, "observations"), (ours.actions, "actions"), (ours.rewards, "rewards")):
+        np.testing.assert_array_equal(found, theirs[name])
+    np.testing.assert_array_equal(ours.discounts, 0.5 * theirs["masks"])
+    counts = theirs["masks"] == 1
+    assert counts.sum() <= 1900
+    np.testing.assert_array_equal(ours.next_observations[counts], theirs["next_observations"][counts])
