@@ -1,12 +1,13 @@
 .DELETE_ON_ERROR:
-.PHONY: help install demo test test-all bench baselines lowest highest newest audit licences docs dist format lint type linked clean
+.PHONY: help install demo test test-all bench baselines ogbench lowest highest newest audit licences docs dist format lint type linked clean
 
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
-# d3rlpy needs another gymnasium, robomimic a torchvision.
+# d3rlpy needs another gymnasium, robomimic a torchvision, OGBench another MuJoCo.
 OTHERS := .venv-baselines
 ROBOMIMIC := .venv-robomimic
+OGBENCH := .venv-ogbench
 # What looks at dependencies, makes the site and looks at what is published, apart from them.
 TOOLS := .venv-tools
 # Tests of each part that meets other packages.
@@ -27,6 +28,7 @@ help:
 	@echo "make bench    DT and DTFM beside d3rlpy, training and acting: 15 minutes on 2 idle cores"
 	@echo "make baselines    DT and DTFM beside d3rlpy's and robomimic's algorithms on studies/baselines.yml: days on one core;"
 	@echo "              ARGUMENTS=\"--data can-few --seeds 0\" runs some of it, ARGUMENTS=--help says what there is"
+	@echo "make ogbench  environment of studies/ogbench in $(OGBENCH), with this package and OGBench"
 	@echo "make lowest   tests of each part with the lowest versions that pyproject.toml allows; make highest: the highest"
 	@echo "make newest   tests of the package without robosuite on the newest Python here, with constraints-numpy2.txt: a minute"
 	@echo "make audit    ask for known vulnerabilities of the pinned versions; needs the network"
@@ -93,6 +95,17 @@ $(ROBOMIMIC)/installed: constraints.txt
 	$(ROBOMIMIC)/bin/pip install --disable-pip-version-check --quiet $$(grep '^torch==' constraints.txt) numpy h5py matplotlib \
 		pillow six termcolor tqdm
 	$(ROBOMIMIC)/bin/pip install --disable-pip-version-check --quiet --no-deps robomimic==0.3.0 torchvision==0.28.0
+	@touch $@
+
+ogbench: install $(OGBENCH)/installed
+
+# OGBench refuses the pinned MuJoCo 3.9.0.
+$(OGBENCH)/installed: constraints.txt
+	rm -rf $(OGBENCH)
+	$(BIN)/python -m venv $(OGBENCH)
+	grep -v '^mujoco==' constraints.txt > $(OGBENCH)/constraints.txt
+	$(OGBENCH)/bin/pip install --disable-pip-version-check --quiet -c $(OGBENCH)/constraints.txt -e ".[zoo]" \
+		ogbench==1.2.2 mujoco==3.8.1 dm_control==1.0.41
 	@touch $@
 
 lowest: RESOLUTION := lowest-direct
@@ -168,4 +181,4 @@ linked:
 	@ln -s $(CURDIR)/envs $(CURDIR)/zoo_configs build/linked/sb3_dtfm/
 
 clean:
-	rm -rf $(VENV) $(OTHERS) $(ROBOMIMIC) $(TOOLS) .venv-lowest .venv-highest .venv-newest build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(OTHERS) $(ROBOMIMIC) $(OGBENCH) $(TOOLS) .venv-lowest .venv-highest .venv-newest build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache

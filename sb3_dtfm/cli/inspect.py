@@ -16,6 +16,7 @@ from sb3_dtfm.data import DatasetError, TrajectoryBuffer, check_action_space, lo
 from sb3_dtfm.data.decisions import decide, sentences
 from sb3_dtfm.data.inspection import Inspection, Range, inspect_buffer
 from sb3_dtfm.envs import flatten_observation_space, register_gymnasium_robotics
+from sb3_dtfm.envs.packages import import_packages
 
 BLUE, RED, GREY = "#1b6ca8", "#c0562b", "0.6"
 # Options that choose among episodes by what they come to.
@@ -35,6 +36,7 @@ def main(argv: Sequence[str]) -> None:
     :param argv: its arguments
     """
     options = _parser().parse_args(argv)
+    import_packages(options.gym_packages)
     dataset = options.dataset[0] if len(options.dataset) == 1 else options.dataset
     buffer = load(dataset, dict(options.dataset_kwargs), options.env)
     found = inspect_buffer(buffer)
@@ -45,7 +47,7 @@ def main(argv: Sequence[str]) -> None:
     for sentence in sentences(decide(buffer)):
         print(f"- {sentence}")
     print(f"\nTo load it in Python:\n  {loading(dataset, dict(options.dataset_kwargs), options.env)}")
-    print(f"\nTo begin with:\n  {command(options.dataset, options.dataset_kwargs, buffer, found)}")
+    print(f"\nTo begin with:\n  {command(options.dataset, options.dataset_kwargs, options.gym_packages, buffer, found)}")
     print(f"\nPicture: {draw(buffer, found, Path(options.output), ' + '.join(options.dataset))}")
 
 
@@ -104,6 +106,7 @@ def _parser() -> argparse.ArgumentParser:
         help="options of its reader, as for train",
     )
     argument("--env", metavar="ID", help="environment to learn it for; by default what the dataset names")
+    argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="to import first: they register tasks")
     argument("-o", "--output", default="dataset.png", metavar="FILE", help="PNG to write; dataset.png by default")
     return parser
 
@@ -153,12 +156,11 @@ def loading(dataset: str | list[str], options: dict[str, Any], env_id: str | Non
     :param env_id: as for :func:`load`
     :return: Python that reads the dataset
     """
-    given = [f"{name}={value!r}" for name, value in options.items()]
-    known = []
+    given = {name: repr(value) for name, value in options.items()}
     if env_id is not None:
         limit = gym.spec(env_id).max_episode_steps
-        known = [f"action_space=gymnasium.make({env_id!r}).action_space", f"max_episode_steps={limit}"]
-    return f"sb3_dtfm.data.load_dataset({', '.join([repr(dataset), *known, *given])})"
+        given = {"action_space": f"gymnasium.make({env_id!r}).action_space", "max_episode_steps": repr(limit), **given}
+    return f"sb3_dtfm.data.load_dataset({', '.join([repr(dataset), *map('='.join, given.items())])})"
 
 
 def _actions(buffer: TrajectoryBuffer, found: Inspection) -> str:
@@ -180,19 +182,25 @@ def _interval(low: np.ndarray, high: np.ndarray) -> str:
 
 
 def command(
-    datasets: Sequence[str], dataset_kwargs: Sequence[tuple[str, Any]], buffer: TrajectoryBuffer, found: Inspection
+    datasets: Sequence[str],
+    dataset_kwargs: Sequence[tuple[str, Any]],
+    gym_packages: Sequence[str],
+    buffer: TrajectoryBuffer,
+    found: Inspection,
 ) -> str:
     """
     A training of this dataset.
 
     :param datasets: as given
     :param dataset_kwargs: as given
+    :param gym_packages: as given
     :param buffer: the dataset
     :param found: in it
     """
     algo = "dtfm" if isinstance(buffer.action_space, spaces.Box) else "dt"
     words = ["sb3-dtfm", "train", "--algo", algo, "--env", buffer.env_id or "TASK"]
     words += ["--dataset", *datasets, "--target-return", f"{found.target_return:g}"]
+    words += ["--gym-packages", *gym_packages] if gym_packages else []
     if dataset_kwargs:
         inside = ", ".join(f"{key}={value!r}" for key, value in dataset_kwargs)
         words += ["-params", f"dataset_kwargs:dict({inside})"]

@@ -25,7 +25,7 @@ class D3rlpyLearner:
     """
     One of d3rlpy's algorithms.
 
-    :param settings: `algorithm`, one of `CONFIGS`; `hidden` layers, `critic_layer_norm`, the actor's `dropout`;
+    :param settings: `algorithm`, one of `CONFIGS`; `hidden` layers, `critic_layer_norm` (of Q and V), the actor's `dropout`;
         `standardize` observations, `reward` scaling; a `cosine` schedule of the actor's learning rate, `adamw` options; and
         fields of the algorithm's configuration
     :param dataset: to learn from
@@ -98,7 +98,7 @@ def _encoders(settings: dict[str, Any], fields: set[str]) -> dict[str, Any]:
     def encoder(name: str) -> Any:
         return d3rlpy.models.VectorEncoderFactory(
             settings["hidden"],
-            use_layer_norm=name.startswith("critic") and settings.get("critic_layer_norm", False),
+            use_layer_norm=name.startswith(("critic", "value")) and settings.get("critic_layer_norm", False),
             dropout_rate=settings.get("dropout") if name.startswith("actor") else None,
             exclude_last_activation="context_size" in fields,  # it only embeds there
         )

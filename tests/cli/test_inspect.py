@@ -1,6 +1,7 @@
 """What is in a dataset: real recordings, and arrays of which every fault is known."""
 
 import shlex
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -147,6 +148,25 @@ def test_the_environment_tells_of_the_range_of_actions(workplace, capsys):
     loading = text.split("To load it in Python:\n")[1].splitlines()[0]
     buffer = eval(loading, {"gymnasium": gymnasium, "sb3_dtfm": sb3_dtfm})
     assert (buffer.action_space.high[0], buffer.n_episodes) == (2.0, 4)
+    shorter = ["--dataset-kwargs", "max_episode_steps:3"]
+    with pytest.warns(UserWarning, match="4 of 4 episodes have more than 3 steps"):
+        assert main(["inspect", "swings.npz", "--env", "Pendulum-v1", *shorter]) == 0
+    loading = capsys.readouterr().out.split("To load it in Python:\n")[1].splitlines()[0]
+    with pytest.warns(UserWarning, match="4 of 4 episodes have more than 3 steps"):
+        assert len(eval(loading, {"gymnasium": gymnasium, "sb3_dtfm": sb3_dtfm})) == 12
+
+
+def test_a_task_of_another_package_is_found(workplace, capsys):
+    Path("inspected_tasks.py").write_text(
+        "import gymnasium as gym\n"
+        "gym.register('Inspected-v0', 'gymnasium.envs.classic_control:PendulumEnv', max_episode_steps=4)\n"
+    )
+    np.savez("swings.npz", **pendulum_arrays())
+    with pytest.warns(UserWarning, match="4 of 4 episodes have more than 4 steps"):
+        assert main(["inspect", "swings.npz", "--env", "Inspected-v0", "--gym-packages", "inspected_tasks"]) == 0
+    command = capsys.readouterr().out.split("To begin with:\n")[1].splitlines()[0]
+    assert command.endswith("--gym-packages inspected_tasks")
+    assert main([*shlex.split(command)[1:], "-n", "2", "--eval-freq", "-1", "--verbose", "0"]) == 0
 
 
 def test_data_of_another_environment_are_refused(workplace, capsys):

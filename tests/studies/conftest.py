@@ -3,4 +3,5 @@
 import sys
 from pathlib import Path
 
-sys.path.append(str(Path(__file__).parents[2] / "studies"))
+STUDIES = Path(__file__).parents[2] / "studies"
+sys.path += [str(STUDIES), str(STUDIES / "ogbench")]
