@@ -30,10 +30,10 @@ from sb3_dtfm.data.flat import (
     told_flags,
     warn_of_made_up_rewards,
 )
-from sb3_dtfm.data.observations import chosen_space, flatten_chosen, observed
+from sb3_dtfm.data.observations import chosen_space, observed
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_space, wrap_dataset_errors
-from sb3_dtfm.envs.return_to_go import flatten_observation_space
+from sb3_dtfm.envs.return_to_go import flatten_observation_space, image_spaces, without_images
 from sb3_dtfm.envs.success import reported_success
 
 # What one step of an episode that was written down step by step holds: Gymnasium's, SB3's, and the shortest.
@@ -358,8 +358,10 @@ def load_replay_buffer(
     """
     source = "replay buffer"
     try:
-        observation_space = chosen_space(replay_buffer.observation_space, observation_keys, source)
-        flat_space = flatten_observation_space(observation_space)
+        shown = replay_buffer.observation_space
+        keys = observation_keys and [key for key in observation_keys if key not in image_spaces(shown)]
+        vectors = spaces.Box(0.0, 0.0, (1,), np.float32) if keys == [] else without_images(shown)
+        flat_space = flatten_observation_space(chosen_space(vectors, keys or None, source))
     except DatasetError:
         raise
     except ValueError as error:
@@ -383,18 +385,15 @@ def load_replay_buffer(
         steps = order[start:stop]
         done, late = (bool(flags[steps[-1], env]) for flags in (replay_buffer.dones, replay_buffer.timeouts))
 
-        def read(_: str, *keys: str) -> np.ndarray:
-            observations: Any = replay_buffer.observations
-            for key in keys:
-                observations = observations[key]
-            return np.asarray(observations[steps, env])
-
-        columns = flatten_chosen(read, observation_keys, observation_space, f"{source}, {name}")
+        found: Any = replay_buffer.observations
+        entries = {key: each[steps, env] for key, each in found.items()} if isinstance(found, dict) else found[steps, env]
+        seen = observed(entries, observation_keys, shown, f"{source}, {name}")
         actions = replay_buffer.actions[steps, env]
         if isinstance(space, spaces.Box):
             actions = space.low + 0.5 * (actions.astype(np.float64) + 1.0) * (space.high - space.low)
         return Trajectory(
-            observations=np.concatenate(columns, axis=1),
+            observations=seen.vectors,
+            images=seen.images,
             actions=fitted(actions, space, clip_actions),
             rewards=replay_buffer.rewards[steps, env],
             terminated=done and not late,

@@ -28,7 +28,7 @@ from sb3_dtfm.data.hdf5 import open_group, read_hdf5
 from sb3_dtfm.data.observations import ReadArray, chosen_space, flatten_chosen
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, check_flags, wrap_dataset_errors
-from sb3_dtfm.envs.return_to_go import flatten_observation_space
+from sb3_dtfm.envs.return_to_go import flatten_observation_space, image_spaces
 from sb3_dtfm.envs.success import SUCCESS
 
 METADATA_FILE_NAME, HDF5_FILE_NAME = "metadata.json", "main_data.hdf5"
@@ -260,6 +260,12 @@ def _n_episodes(folder: Path, data_format: str, dataset_id: str) -> int:
 
 
 def _space(space: spaces.Space, keys: Sequence[str] | None, source: str) -> spaces.Space:
+    cameras = [camera for camera in image_spaces(space) if keys is None or camera in keys]
+    if cameras:
+        raise DatasetError(
+            f"{source}: images of {', '.join(cameras)} are not read from Minari datasets; observation_keys=[...] chooses "
+            "vectors."
+        )
     try:
         return chosen_space(space, keys, source)
     except DatasetError:

@@ -155,8 +155,11 @@ def test_what_there_is_to_remark():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_images_in_arrays_are_refused(kind, tmp_path):
+def test_images_in_arrays_stay_images(kind, tmp_path):
     images = np.zeros((5, 8, 8, 3), np.uint8)
-    with pytest.raises(DatasetError, match=r"observations has shape .*8, 8, 3\) and holds images; only vectors of numbers"):
-        load_dataset(KINDS[kind](tmp_path, observations=images), action_space=SPACE)
+    buffer = load_dataset(KINDS[kind](tmp_path, observations=images), action_space=SPACE)
+    assert buffer.own("image").shape == images.shape
+    for unfit in (images[..., 0], images.astype(np.float32)):
+        with pytest.raises(DatasetError, match=r"expected images as uint8 of \(steps, height, width"):
+            load_dataset(KINDS[kind](tmp_path, observations=unfit), action_space=SPACE)
     check(load_dataset(KINDS[kind](tmp_path, observations=images[:, :, 0, 0]), action_space=SPACE))

@@ -8,7 +8,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import DDPG
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -351,9 +351,27 @@ def test_a_replay_buffer_without_a_whole_episode():
     empty = ReplayBuffer(10, spaces.Box(-1, 1, (3,)), spaces.Box(-1, 1, (2,)), device="cpu")
     with pytest.raises(DatasetError, match="replay buffer: holds no whole episode in 0 steps of 1 environments"):
         load_dataset(empty)
-    images = ReplayBuffer(10, spaces.Box(0, 255, (8, 8, 3), np.uint8), spaces.Box(-1, 1, (2,)), device="cpu")
-    with pytest.raises(DatasetError, match=r"replay buffer: Observation space .* holds an image"):
+    images = ReplayBuffer(10, spaces.Box(0, 255, (8, 8), np.uint8), spaces.Box(-1, 1, (2,)), device="cpu")
+    with pytest.raises(DatasetError, match=r"replay buffer: Observation space .* is no image that can be used"):
         load_dataset(images)
     several = ReplayBuffer(10, spaces.Box(-1, 1, (3,)), spaces.MultiBinary(3), device="cpu")
     with pytest.raises(DatasetError, match=r"replay buffer: the action space is MultiBinary\(3\)"):
         load_dataset(several)
+
+
+def test_a_replay_buffers_images_stay_bytes():
+    """As `SAC("MultiInputPolicy", ...)` stores them, channels first."""
+    image = spaces.Box(0, 255, (3, 16, 16), np.uint8)
+    space = spaces.Dict({"camera": image, "gripper": spaces.Box(-1, 1, (2,), np.float32)})
+    replay_buffer = DictReplayBuffer(10, space, spaces.Box(-1, 1, (1,)), device="cpu", handle_timeout_termination=True)
+    space.seed(0)
+    frames = [space.sample() for _ in range(4)]
+    for step, frame in enumerate(frames):
+        seen = {key: each[None] for key, each in frame.items()}
+        replay_buffer.add(seen, seen, np.zeros((1, 1)), np.ones(1), np.array([step == 3]), [{}])
+    buffer = load_dataset(replay_buffer)
+    np.testing.assert_array_equal(buffer.own("camera").numpy(), [frame["camera"] for frame in frames])
+    np.testing.assert_array_equal(buffer.observations.numpy(), [frame["gripper"] for frame in frames])
+    alone = load_dataset(replay_buffer, observation_keys=["camera"])
+    assert list(alone.image_spaces) == ["camera"]
+    assert (alone.observations == 0).all()

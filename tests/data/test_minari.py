@@ -292,7 +292,7 @@ def test_only_bounded_box_actions_are_accepted(space: spaces.Space, actions: np.
 def test_images_are_refused():
     images = np.zeros((4, 40, 40, 3), np.uint8)
     dataset = write([make_episode(3, observations=images)], observation_space=spaces.Box(0, 255, (40, 40, 3), np.uint8))
-    with pytest.raises(DatasetError, match=r"test/set-v0.*holds an image"):
+    with pytest.raises(DatasetError, match=r"test/set-v0.*images of image are not read from Minari datasets"):
         load_minari(dataset)
 
 

@@ -172,8 +172,9 @@ def test_a_matrix_is_flattened():
 @pytest.mark.parametrize(
     ("space", "message"),
     [
-        (spaces.Box(0, 255, (64, 64, 3), np.uint8), "holds an image"),
-        (spaces.Dict(camera=spaces.Box(0, 255, (64, 64), np.uint8)), "holds an image"),
+        (spaces.Dict(camera=spaces.Box(0, 255, (64, 64), np.uint8)), "is no image that can be used: height, width and"),
+        (spaces.Dict(arm=spaces.Dict(camera=spaces.Box(0, 255, (64, 64, 3), np.uint8))), "an entry of the Dict that the"),
+        (spaces.Dict(observation=spaces.Box(0, 255, (64, 64, 3), np.uint8)), "An image is called observation"),
         (spaces.Text(5), "cannot be flattened"),
         (spaces.Sequence(spaces.Discrete(3)), "cannot be flattened"),
         (spaces.Dict(), "cannot be flattened"),
