@@ -32,7 +32,7 @@ def choose_together(policies: list[SequencePolicy], draws_of_all: bool) -> None:
     def decide(windows: Windows, rows: np.ndarray, deterministic: bool) -> th.Tensor:
         seen = windows.observations[:, -1]
         drawn = [
-            each._draw_candidates(newest_hidden(each, windows), seen, rows, deterministic)[0]
+            each._best_of_n(newest_hidden(each, windows), seen, rows, deterministic)[0]
             for each in (policies if draws_of_all else policies[:1])
         ]
         candidates = th.cat(drawn, dim=1)

@@ -57,20 +57,17 @@ def replace_choice(policies: list[SequencePolicy], decide: Decide) -> None:
     for policy in policies:
         policy.set_training_mode(False)
 
-    def choose(context: Context, due: np.ndarray, deterministic: bool) -> tuple[np.ndarray, np.ndarray]:
-        keys_values = np.zeros((len(due), 0), np.float32)
-        if not due.any():
-            return np.zeros((0, first.chunk_size, first.action_dim), np.float32), keys_values
+    def choose(context: Context, due: np.ndarray, hidden: th.Tensor, deterministic: bool) -> th.Tensor:
         windows = Windows(*(th.from_numpy(each[due]) for each in context.windows))
         rows = context.timesteps[due, -1] + context.episode_keys[due]
-        return first._to_chunks(decide(windows, rows, deterministic)), keys_values
+        return decide(windows, rows, deterministic)
 
     first._choose = choose  # type: ignore[method-assign]
 
 
 def newest_hidden(policy: SequencePolicy, windows: Windows) -> th.Tensor:
     """Hidden states of the newest steps, (b, D)."""
-    return policy.hidden_states(policy.acting_network, windows, last_only=True).squeeze(1)
+    return policy.acting_network.newest_hidden(policy.normalization(windows))
 
 
 def decide_together(policies: list[SequencePolicy], way: str) -> None:
@@ -83,7 +80,9 @@ def decide_together(policies: list[SequencePolicy], way: str) -> None:
 
     def decide(windows: Windows, rows: np.ndarray, deterministic: bool) -> th.Tensor:
         noise = policies[0]._acting_noise(rows, deterministic)
-        return agree(th.stack([each._decode(newest_hidden(each, windows), noise) for each in policies]), way, rows)
+        return agree(
+            th.stack([each.acting_network.decode(newest_hidden(each, windows), noise) for each in policies]), way, rows
+        )
 
     replace_choice(policies, decide)
 

@@ -1,18 +1,20 @@
 """robosuite's tasks as Gymnasium environments, with robomimic's low-dimensional observation."""
 
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_dtfm.envs.robosuite.cameras import Cameras, camera_args
 from sb3_dtfm.envs.robosuite.scene import CONTROL_FREQUENCY, import_robosuite, make_robosuite, scene_xml
 from sb3_dtfm.envs.robosuite.sensors import Observer
 from sb3_dtfm.envs.robosuite.tasks import TASKS
 
 
-class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
+class RobosuiteEnv(gym.Env[Any, np.ndarray]):
     """
     A Panda arm on one of robosuite's tasks, moved by an OSC_POSE delta controller at 20 Hz.
 
@@ -37,6 +39,10 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
     :param controller_config: robosuite 1.5 composite controller, or a single-arm controller of robosuite <= 1.4;
         robosuite's default for the Panda if not given
     :param lite_physics: robosuite's faster stepping (one forward pass per physics step); same dynamics
+    :param cameras: observed ones, such as "agentview" and "robot0_eye_in_hand": the observation is a Dict then, of their
+        images and of the arm's own numbers, by robomimic's names
+    :param camera_size: height and width of these images, pixels
+    :param object_state: observe `object`, too; not given, only without cameras
     :param camera_name: camera of `rgb_array` frames
     :param width: of `rgb_array` frames, pixels
     :param height: of `rgb_array` frames, pixels
@@ -51,6 +57,9 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
         render_mode: str | None = None,
         controller_config: dict[str, Any] | None = None,
         lite_physics: bool = True,
+        cameras: Sequence[str] = (),
+        camera_size: int = 84,
+        object_state: bool | None = None,
         camera_name: str = "agentview",
         width: int = 256,
         height: int = 256,
@@ -77,8 +86,15 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
         self._low, self._high = low.astype(np.float32), high.astype(np.float32)
         self.action_space = spaces.Box(self._low, self._high, dtype=np.float32)
         self._start_from(self.state)
-        self._observe = Observer(self._env)
-        self.observation_space = spaces.Box(-np.inf, np.inf, (self._observe.size,), np.float32)
+        self._observer = Observer(self._env)
+        self._camera_size = camera_size
+        self._cameras = Cameras(self._env.sim.model._model, cameras, camera_size) if cameras else None
+        hidden = {"object"} if object_state is False or (cameras and not object_state) else set()
+        self._keys = {key: width for key, width in self._observer.keys.items() if key not in hidden}
+        vectors = {key: spaces.Box(-np.inf, np.inf, (width,), np.float32) for key, width in self._keys.items()}
+        self.observation_space: spaces.Space[Any] = spaces.Box(-np.inf, np.inf, (sum(self._keys.values()),), np.float32)
+        if self._cameras is not None:
+            self.observation_space = spaces.Dict({**self._cameras.space, **vectors})
 
     @property
     def state(self) -> np.ndarray:
@@ -88,7 +104,7 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
     @property
     def observation_keys(self) -> dict[str, int]:
         """robomimic's names of what an observation holds, in order, and how many numbers each has."""
-        return dict(self._observe.keys)
+        return dict(self._observer.keys)
 
     @property
     def model_file(self) -> str:
@@ -112,12 +128,11 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
                 "has_offscreen_renderer": False,
                 "ignore_done": True,
                 "use_object_obs": True,
-                "use_camera_obs": False,
-                "camera_depths": False,
+                **camera_args(self._cameras.names if self._cameras is not None else (), self._camera_size),
             },
         }
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """
         Draw a new start, or take a recorded one.
 
@@ -136,7 +151,7 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
             self.render()
         return self._observe(), {"is_success": False}
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """
         Move for 0.05 s.
 
@@ -183,13 +198,22 @@ class RobosuiteEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def close(self) -> None:
         """Free the renderer, the viewer and the simulation."""
-        for name in ("_renderer", "_viewer"):
+        for name in ("_renderer", "_viewer", "_cameras"):
             if getattr(self, name, None) is not None:
                 getattr(self, name).close()
                 setattr(self, name, None)
         if getattr(self, "_env", None) is not None:
             self._env.close()
             self._env = None
+
+    def _observe(self) -> Any:
+        """The present observation: (O,) float32, or by key where cameras see it."""
+        seen = self._observer()
+        if self._cameras is None:
+            return seen[: sum(self._keys.values())]  # the object's part comes last
+        parts = np.split(seen, np.cumsum(list(self._observer.keys.values()))[:-1])
+        vectors = {key: part for key, part in zip(self._observer.keys, parts, strict=True) if key in self._keys}
+        return {**self._cameras(self._env.sim.data._data), **vectors}
 
     def _find_references(self) -> None:
         env, robot = self._env, self._env.robots[0]

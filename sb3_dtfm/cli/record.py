@@ -31,6 +31,8 @@ AGENT_OPTIONS: dict[str, tuple[bool, dict]] = {
 DEMONSTRATOR_OPTIONS: dict[str, tuple[bool, dict]] = {
     "output": (True, {"metavar": "FILE", "help": "robomimic hdf5 file to write"}),
     "pause": (False, {"type": float, "metavar": "STEPS", "help": "mean time that the hand rests before it closes"}),
+    "camera": (False, {"nargs": "+", "metavar": "NAME", "help": "record images of these cameras, e.g. agentview"}),
+    "camera_size": (False, {"type": int, "metavar": "PIXELS", "help": "their height and width, 84 by default"}),
     "workers": (False, {"type": int, "metavar": "N", "help": "processes side by side"}),
 }
 
@@ -111,6 +113,8 @@ def _record_demonstrations(options: argparse.Namespace) -> None:
         seed=options.seed,
         n_workers=options.workers,
         overwrite=options.overwrite,
+        cameras=options.camera or (),
+        camera_size=options.camera_size or 84,
     )
     print(summary)
 

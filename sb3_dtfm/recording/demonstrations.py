@@ -10,13 +10,14 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from tqdm import tqdm
 
 from sb3_dtfm.envs.robosuite import TASKS, RobosuiteEnv
+from sb3_dtfm.envs.robosuite.cameras import camera_args
 from sb3_dtfm.envs.robosuite.demonstrators import Demonstrator
 from sb3_dtfm.recording.episodes import EpisodeRecorder, RecordedEpisode, add_noise, check_recording, run_episodes
 from sb3_dtfm.recording.robomimic import refuse_existing, write_robomimic
@@ -67,6 +68,8 @@ def record_demonstrations(
     progress: bool = True,
     noise: float = 0.0,
     pause: float = 0.0,
+    cameras: Sequence[str] = (),
+    camera_size: int = 84,
 ) -> RecordingSummary:
     """
     Let a scripted demonstrator do a task until it has succeeded `n_episodes` times, and write those episodes.
@@ -85,6 +88,8 @@ def record_demonstrations(
         clipped into the action space, and what is recorded is what was executed
     :param pause: steps that the hand rests before it closes, on average and after a first one; geometrically distributed,
         and 0 closes at once
+    :param cameras: whose images are recorded beside the numbers, see :class:`~sb3_dtfm.envs.robosuite.RobosuiteEnv`
+    :param camera_size: height and width of these images, pixels
     :raises FileExistsError: `output` exists and is not to be overwritten
     :raises ValueError: unknown task, numbers out of range, or fewer than one attempt in 5 succeeds
     """
@@ -98,8 +103,11 @@ def record_demonstrations(
     refuse_existing(Path(output), overwrite)
     start = time.monotonic()
     n_workers = min(n_workers or _n_cores(), n_episodes)
-    env_args = _environment(task).env_args  # before the workers fork, which then have the compiled scene too
-    attempt = functools.partial(_attempt, task, seed, noise, pause)
+    scene = (task, tuple(cameras), camera_size)
+    # Before the workers fork, which then have the compiled scene too; but nothing to draw with, which would hang there.
+    env_args = _environment(task, (), camera_size).env_args
+    env_args["env_kwargs"] |= camera_args(cameras, camera_size)
+    attempt = functools.partial(_attempt, scene, seed, noise, pause)
     limit = n_episodes * ATTEMPTS_PER_EPISODE + 10
     lengths: list[int] = []
     n_attempts = 0
@@ -122,6 +130,9 @@ def record_demonstrations(
 
     with closing(_run(attempt, n_workers, limit)) as attempts:
         write_robomimic(output, successes(attempts), env_args, seed)
+    if cameras and n_workers == 1:  # MuJoCo complains of what is still open when Python ends
+        _environment(*scene).close()
+        _environment.cache_clear()
     return RecordingSummary(Path(output), n_episodes, n_attempts, float(np.mean(lengths)), time.monotonic() - start)
 
 
@@ -143,23 +154,27 @@ def _run(attempt: Callable[[int], RecordedEpisode], n_workers: int, limit: int) 
 
 
 @functools.cache
-def _environment(task: str) -> RobosuiteEnv:
+def _environment(task: str, cameras: tuple[str, ...], camera_size: int) -> RobosuiteEnv:
     """One of each task per process: compiling the scene takes longer than an episode."""
-    return RobosuiteEnv(demonstrated_tasks()[task][0])
+    return RobosuiteEnv(demonstrated_tasks()[task][0], cameras=cameras, camera_size=camera_size, object_state=True)
 
 
-def _attempt(task: str, seed: int, noise: float, pause: float, number: int) -> RecordedEpisode:
+def _attempt(scene: tuple[str, tuple[str, ...], int], seed: int, noise: float, pause: float, number: int) -> RecordedEpisode:
     """One episode, which has succeeded if it is terminated."""
-    env = _environment(task)
+    env = _environment(*scene)
     env_seed, demonstrator_seed, noise_seed = map(int, np.random.SeedSequence((seed, number)).generate_state(3))
-    demonstrator = demonstrated_tasks()[task][1](demonstrator_seed, pause)
+    demonstrator = demonstrated_tasks()[scene[0]][1](demonstrator_seed, pause)
 
-    def act(observations: np.ndarray, starts: np.ndarray, numbers: Sequence[int]) -> np.ndarray:
+    def act(observations: Any, starts: np.ndarray, numbers: Sequence[int]) -> np.ndarray:
+        if isinstance(observations, dict):
+            observations = np.concatenate([observations[key] for key in env.observation_keys], axis=1)
         return demonstrator.act(observations[0])[None]
 
     assert isinstance(env.action_space, spaces.Box)
     noisy = add_noise(act, env.action_space, noise, lambda _: np.random.default_rng(noise_seed))
     episode = next(run_episodes([EpisodeRecorder(env, simulation=True)], noisy, [env_seed]))
+    if scene[1]:
+        return episode
     widths = env.observation_keys
     ends = np.cumsum(list(widths.values()))[:-1]
     by_key = [dict(zip(widths, np.split(observation, ends), strict=True)) for observation in episode.observations]

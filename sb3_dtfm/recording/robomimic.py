@@ -53,6 +53,9 @@ def _write_demo(data: h5py.Group, name: str, episode: RecordedEpisode) -> int:
     demo = data.create_group(name)
     n_steps = len(episode.actions)
     for key, values in stack_observations(episode.observations).items():
+        if values.dtype == np.uint8:  # images, of which the next ones would double the file
+            demo.create_dataset(f"obs/{key}", data=values[:-1], compression="gzip", chunks=(1, *values.shape[1:]))
+            continue
         demo[f"obs/{key}"] = values[:-1]
         demo[f"next_obs/{key}"] = values[1:]
     demo["actions"] = np.stack(episode.actions)

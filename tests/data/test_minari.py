@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
+from packaging.version import Version
 
 from sb3_dtfm.data import DatasetError, load_minari
 from sb3_dtfm.envs import ReturnToGoWrapper, register_gymnasium_robotics, return_to_go_space
@@ -314,6 +315,7 @@ def test_a_dataset_of_a_newer_minari_is_no_damaged_one():
         load_minari("test/set-v0")
 
 
+@pytest.mark.skipif(Version(minari.__version__) >= Version("0.5.4"), reason="Minari 0.5.4 stores bytes as they are")
 @pytest.mark.parametrize("seen", ["vectors", "one image a step"])
 def test_vectors_that_minari_stores_as_jpeg_are_named(seen: str):
     """Bytes of shape (T + 1, 6) count as an image; frames that happen to be of one length become a table."""
