@@ -4,13 +4,13 @@ import os
 from typing import Any
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_dtfm.envs.go1.model import HOME, TRUNK, build_spec
+from sb3_dtfm.envs.go1.model import HOME, build_spec
 from sb3_dtfm.envs.go1.randomization import START_VELOCITY, Randomizer, add_noise, draw_push, draw_robot
+from sb3_dtfm.envs.go1.rendering import Camera
 from sb3_dtfm.envs.go1.rewards import Step, reward_terms, total_reward
 from sb3_dtfm.envs.go1.second import MotorSimulation
 from sb3_dtfm.envs.go1.simulation import DECISION, Motion, Simulation
@@ -59,9 +59,9 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
         self.simulation = Simulation(build_spec().compile()) if model_file is None else MotorSimulation(model_file)
         self.randomize = randomize
         self.render_mode = render_mode
-        self._size = height, width
+        self.width, self.height = width, height
         self._randomizer = Randomizer(self.simulation)
-        self._renderer: Any = None
+        self._camera: Camera | None = None
         self.observation_space = spaces.Box(-np.inf, np.inf, (45,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (12,), np.float32)
         self.command = np.zeros(3)
@@ -116,21 +116,13 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
         """The robot from a camera that follows it, (height, width, 3) uint8."""
         if self.render_mode is None:
             return None
-        if self._renderer is None:
-            self._renderer = mujoco.Renderer(self.simulation.model, *self._size)
-            self._camera = mujoco.MjvCamera()
-            self._camera.type, self._camera.trackbodyid = (
-                mujoco.mjtCamera.mjCAMERA_TRACKING,
-                self.simulation.model.body(TRUNK).id,
-            )
-            self._camera.distance, self._camera.azimuth, self._camera.elevation = 1.5, 120.0, -20.0
-        self._renderer.update_scene(self.simulation.data, self._camera)
-        return self._renderer.render()
+        self._camera = self._camera or Camera(self.simulation, self.width, self.height)
+        return self._camera.frame()
 
     def close(self) -> None:
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None
 
     def _draw_command(self) -> None:
         asked = self.np_random.random(3) < COMMAND_SHARES

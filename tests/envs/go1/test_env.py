@@ -1,5 +1,7 @@
 """Go1Velocity-v0: what Gymnasium and Stable-Baselines3 expect, commands, randomisation, repetition."""
 
+import ctypes.util
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from stable_baselines3.common.env_checker import check_env as check_sb3_env
 from sb3_dtfm.envs.go1.env import COMMAND_LIMITS, Go1Env, TeacherObservation
 from sb3_dtfm.envs.go1.model import HOME
 from sb3_dtfm.envs.go1.randomization import NOISE, RANGES, Randomizer, add_noise, draw_push, draw_robot
+from tests.envs.robosuite.conftest import run_python
 
 
 @pytest.fixture(scope="module")
@@ -223,6 +226,22 @@ def test_a_late_target_leaves_the_last_one_in_force():
     env.step(np.full(12, 0.2))
     env.step(np.full(12, -0.2))
     np.testing.assert_allclose(sent, [0.1, 0.1, 0.2, 0.2, 0.2, 0.2, 0.2, 0.0, 0.0, 0.0], atol=1e-7)
+
+
+RENDER = """
+import gymnasium, sb3_dtfm.envs
+env = gymnasium.make("Go1Velocity-v0", render_mode="rgb_array", width=64, height=48)
+env.reset(seed=0)
+image = env.render()
+env.close()
+print(image.shape, image.dtype, image.std() > 10)
+"""
+
+
+@pytest.mark.skipif(ctypes.util.find_library("OSMesa") is None, reason="needs OSMesa")
+def test_renders_without_display():
+    result = run_python(RENDER, MUJOCO_GL="osmesa")
+    assert result.stdout == "(48, 64, 3) uint8 True\n", result.stderr
 
 
 @pytest.mark.parametrize("action", [np.zeros(11), np.full(12, np.nan), np.zeros((1, 12))])
