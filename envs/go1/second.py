@@ -37,6 +37,7 @@ class MotorSimulation(Simulation):
             add_floor(spec)
         super().__init__(spec.compile())
         self.delay = round(DELAY / TIMESTEP)
+        self.kp, self.kd = KP, KD
         axes = np.array([self.model.joint(name).axis for name in JOINT_NAMES])
         if not np.allclose(axes, AXES):
             name = JOINT_NAMES[int(np.flatnonzero(np.abs(axes - AXES).max(axis=1) > 1e-8)[0])]
@@ -46,5 +47,5 @@ class MotorSimulation(Simulation):
             )
 
     def drive(self, targets: np.ndarray) -> None:
-        torques = KP * (targets - self.joint_positions) - KD * self.joint_velocities
+        torques = self.kp * (targets - self.joint_positions) - self.kd * self.joint_velocities
         super().drive(np.clip(torques, -TORQUE_LIMIT, TORQUE_LIMIT))
