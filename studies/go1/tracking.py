@@ -13,6 +13,7 @@ for the speed of a GPU; ours takes as many as it needs.
 
 import argparse
 from collections.abc import Sequence
+from xml.etree import ElementTree
 
 import gymnasium as gym
 import mujoco
@@ -38,11 +39,11 @@ def playground_model(path: str, solver_iterations: tuple[int, int] | None = None
     :param solver_iterations: at most, and of its line search; Playground's own by default
     :return: the model that Playground simulates, on a floor of friction 1
     """
-    spec = mujoco.MjSpec.from_file(path)
-    for geom in [geom for geom in spec.geoms if geom.meshname]:
-        spec.delete(geom)
-    for mesh in list(spec.meshes):
-        spec.delete(mesh)
+    root = ElementTree.parse(path).getroot()
+    for parent in list(root.iter()):
+        for child in [child for child in parent if child.tag == "mesh" or "mesh" in child.attrib]:
+            parent.remove(child)
+    spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
     add_floor(spec, priority=1)
     spec.option.timestep = TIMESTEP
     if solver_iterations is not None:

