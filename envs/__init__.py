@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
+from sb3_dtfm.envs.go1 import register_go1_env
 from sb3_dtfm.envs.robosuite.registration import register_robosuite_envs
 from sb3_dtfm.envs.robotics import AdroitReward, register_gymnasium_robotics, warn_of_reward
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
         share_target_return,
     )
 
+register_go1_env()
 register_robosuite_envs()
 
 __all__ = [
@@ -37,6 +39,7 @@ __all__ = [
     "image_spaces",
     "known_task",
     "recorded_space",
+    "register_go1_env",
     "register_gymnasium_robotics",
     "register_robosuite_envs",
     "return_to_go_space",

@@ -18,12 +18,16 @@ examples:
 
 # Options of each way to record: name, whether it must be given, and what argparse gets.
 AGENT_OPTIONS: dict[str, tuple[bool, dict]] = {
-    "algo": (True, {"help": "algorithm of the agent, e.g. sac, tqc, ppo"}),
-    "model": (True, {"metavar": "PATH", "help": "the agent's zip file, or the folder of its RL-Zoo run"}),
+    "algo": (True, {"help": "algorithm of the agent, e.g. sac, tqc, ppo; onnx for an ONNX file"}),
+    "model": (True, {"metavar": "PATH", "help": "the agent's zip or ONNX file, or the folder of its RL-Zoo run"}),
     "env": (True, {"metavar": "ENV", "help": "Gymnasium environment id"}),
     "dataset_id": (True, {"metavar": "ID", "help": "Minari id to write, e.g. local/halfcheetah/expert-v0"}),
     "vec_normalize": (False, {"metavar": "FILE", "help": "the agent's VecNormalize statistics; 'none' insists on none"}),
     "env_kwargs": (False, {"nargs": "+", "type": key_value, "metavar": "KEY:VALUE", "help": "of the environment"}),
+    "env_wrapper": (
+        False,
+        {"metavar": "CLASS", "help": "what the agent sees the environment through; its run's by default"},
+    ),
     "stochastic": (False, {"action": "store_true", "help": "draw actions instead of taking the best"}),
     "n_envs": (False, {"type": int, "metavar": "N", "help": "environments side by side"}),
     "gym_packages": (False, {"nargs": "+", "metavar": "MODULE", "help": "to import first: tasks, and a run's wrappers"}),
@@ -96,6 +100,7 @@ def _record_agent(options: argparse.Namespace) -> None:
         overwrite=options.overwrite,
         vec_normalize_path=options.vec_normalize,
         env_kwargs=dict(options.env_kwargs or []),
+        env_wrapper=options.env_wrapper,
         **optional,
     )
     print(f"Recorded {dataset.total_episodes} episodes, {dataset.total_steps} steps: {dataset.id}")

@@ -27,8 +27,9 @@ from sb3_dtfm.recording.episodes import (
     check_recording,
     run_episodes,
 )
-from sb3_dtfm.recording.loading import find_agent, load_fitting_agent
+from sb3_dtfm.recording.loading import find_agent, find_wrapper, load_fitting_agent
 from sb3_dtfm.recording.minari import check_dataset_id, write_minari
+from sb3_dtfm.recording.onnx_agent import OnnxAgent
 
 N_RANDOM_EPISODES = 10
 
@@ -48,6 +49,7 @@ def record_agent(
     vec_normalize_path: str | Path | None = None,
     env_kwargs: dict[str, Any] | None = None,
     device: str = "cpu",
+    env_wrapper: str | None = None,
 ) -> minari.MinariDataset:
     """
     Run a trained agent and write its episodes as a Minari dataset.
@@ -63,8 +65,9 @@ def record_agent(
 
     The metadata's `ref_min_score` is the mean return of random actions, `ref_max_score` that of the recorded episodes.
 
-    :param algo: name of the agent's class as RL-Zoo spells it: sac, tqc, ppo, ppo_lstm, ...
-    :param model_path: the agent's zip file, or the folder of its RL-Zoo run
+    :param algo: name of the agent's class as RL-Zoo spells it: sac, tqc, ppo, ppo_lstm, ..., or onnx, for a file with one
+        input (N, O) and an output (N, A)
+    :param model_path: the agent's zip or ONNX file, or the folder of its RL-Zoo run
     :param env_id: Gymnasium id
     :param n_episodes: episodes to record
     :param dataset_id: `namespace/name-vN`, in the folder that MINARI_DATASETS_PATH sets
@@ -79,6 +82,8 @@ def record_agent(
         default, and "none" insists that it has none
     :param env_kwargs: arguments of ``gymnasium.make``, beside those of the agent's run
     :param device: where the agent's network runs
+    :param env_wrapper: class, with its module, of the wrapper that the agent sees the environment through; that of its run
+        by default
     :return: the dataset
     :raises DatasetError: the id is malformed or exists, or the environment's actions are neither a bounded Box nor
         Discrete
@@ -94,7 +99,8 @@ def record_agent(
     files = find_agent(model_path, env_id)
     make_kwargs = {**files.env_kwargs, **(env_kwargs or {})}
     recorders = [EpisodeRecorder(gym.make(env_id, **make_kwargs)) for _ in range(min(n_envs, n_episodes))]
-    envs = [files.wrapper(recorder) for recorder in recorders] if files.wrapper else recorders
+    wrapper = find_wrapper(env_wrapper) if env_wrapper else files.wrapper
+    envs = [wrapper(recorder) for recorder in recorders] if wrapper else recorders
     try:
         check_action_space(recorders[0].action_space, env_id)
         warn_of_reward(recorders[0])
@@ -144,7 +150,7 @@ def random_actions(env: gym.Env, seed: int) -> ActFunction:
     return act
 
 
-def agent_actions(model: BaseAlgorithm, normalizer: VecNormalize | None, deterministic: bool) -> ActFunction:
+def agent_actions(model: BaseAlgorithm | OnnxAgent, normalizer: VecNormalize | None, deterministic: bool) -> ActFunction:
     """The agent's actions, with its memory if it has one."""
     state = None
 

@@ -23,8 +23,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.files import holds_pickles, read_configuration, read_run
 from sb3_dtfm.finetuning import FINETUNED, FinetunedDTFM
+from sb3_dtfm.recording.onnx_agent import OnnxAgent
 
 NOT_NORMALIZED = "none"
+ONNX = "onnx"
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,21 @@ def _read_run(model: Path, run: Path) -> AgentFiles:
             raise ValueError(f"{run / 'config.yml'}: {key} is {hyperparams[key]!r}; agents trained so cannot be recorded.")
     statistics = run / "vecnormalize.pkl" if hyperparams["normalize"] and holds_pickles(model) else None
     return AgentFiles(model, dict(hyperparams["env_kwargs"]), get_wrapper_class(hyperparams), statistics)
+
+
+def find_wrapper(name: str) -> Callable[[gym.Env], gym.Env]:
+    """
+    :param name: a class, with its module: `my_tasks.Scaled`
+    :raises ValueError: there is none of that name
+    """
+    module, _, attribute = name.rpartition(".")
+    try:
+        wrapper: Callable[[gym.Env], gym.Env] = getattr(importlib.import_module(module), attribute)
+    except (AttributeError, ImportError, ValueError) as error:
+        raise ValueError(
+            f"env_wrapper must be a class with its module, such as my_tasks.Scaled, got {name!r}: {error}."
+        ) from error
+    return wrapper
 
 
 @functools.cache
@@ -161,11 +178,11 @@ def _check_algorithm(asked: type[BaseAlgorithm], model: Path) -> None:
 
 def load_fitting_agent(
     algo: str, files: AgentFiles, env: gym.Env, vec_normalize_path: str | Path | None, device: str
-) -> tuple[BaseAlgorithm, VecNormalize | None]:
+) -> tuple[BaseAlgorithm | OnnxAgent, VecNormalize | None]:
     """
     Load an agent for an environment, and what normalises its observations.
 
-    :param algo: class name in any case, or RL-Zoo's name for it
+    :param algo: class name in any case, or RL-Zoo's name for it, or "onnx"
     :param files: the agent's
     :param env: as the agent sees it
     :param vec_normalize_path: statistics instead of those in `files`, or "none" to insist that there are none
@@ -173,7 +190,7 @@ def load_fitting_agent(
     :raises FileNotFoundError: no such statistics
     :raises ValueError: agent, statistics and environment do not fit, or statistics are missing
     """
-    model = load_agent(algo, files.model, device)
+    model = OnnxAgent(files.model) if algo.lower() == ONNX else load_agent(algo, files.model, device)
     for kind in ("observation_space", "action_space"):
         agent_space, env_space = getattr(model, kind), getattr(env, kind)
         if _shapes(agent_space) != _shapes(env_space):
@@ -182,7 +199,8 @@ def load_fitting_agent(
     if vec_normalize_path == NOT_NORMALIZED:
         return model, None
     if vec_normalize_path is None and files.vec_normalize is None:
-        _check_not_normalized(model, files.model)
+        if isinstance(model, BaseAlgorithm):
+            _check_not_normalized(model, files.model)
         return model, None
     return model, _load_vec_normalize(Path(vec_normalize_path or str(files.vec_normalize)), env)
 

@@ -1,0 +1,1 @@
+"""The Go1: how well models of it agree."""

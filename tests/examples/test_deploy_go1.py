@@ -1,0 +1,182 @@
+"""The Go1's deployment: limits, watchdog, start and stop, with a stand-in for the second simulation's file."""
+
+import importlib
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_dtfm import DT
+from sb3_dtfm.data import load_dataset
+from sb3_dtfm.envs import ReturnToGoWrapper
+from sb3_dtfm.envs.go1 import EPISODE_STEPS, env, model, second, simulation
+from sb3_dtfm.envs.go1.env import observation_of
+from tests.envs.go1.test_second import write_model
+
+pytest.importorskip("onnxruntime")
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+@pytest.fixture(scope="module")
+def deploy():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(EXAMPLES)
+        yield importlib.import_module("deploy_go1")
+
+
+@pytest.fixture(scope="module")
+def policy_file(tmp_path_factory) -> Path:
+    """A policy without weights, whose action is 0: it stands."""
+    arrays = {"observations": np.random.default_rng(0).normal(size=(21, 45)), "rewards": np.ones(20)}
+    episodes = [{**arrays, "actions": np.zeros((20, 12))}]
+    task = ReturnToGoWrapper(gym.make("Go1Velocity-v0"), 20.0)
+    small = {"embed_dim": 8, "n_layers": 1, "n_heads": 1}
+    agent = DT("MultiInputPolicy", task, load_dataset(episodes), batch_size=8, context_length=3, policy_kwargs=small)
+    for weights in agent.policy.parameters():
+        weights.data.zero_()
+    path = tmp_path_factory.mktemp("policy") / "policy.onnx"
+    agent.export(path, env_id="Go1Velocity-v0", target_return=20.0)
+    return path
+
+
+@pytest.fixture
+def robot(deploy, tmp_path):
+    return deploy.SimulatedRobot(str(write_model(tmp_path / "go1.xml")))
+
+
+class Recorded:
+    """A robot's commands, with other measurements if told."""
+
+    def __init__(self, robot, **changes):
+        self.robot, self.changes, self.commands = robot, changes, []
+
+    def read(self):
+        return self.robot.read()._replace(**self.changes)
+
+    def command(self, targets, kp, kd):
+        self.commands.append((targets, kp, kd))
+        self.robot.command(targets, kp, kd)
+
+    def wait(self):
+        self.robot.wait()
+
+
+def test_its_numbers_are_those_of_the_task(deploy):
+    np.testing.assert_array_equal(deploy.HOME, model.HOME)
+    np.testing.assert_array_equal(np.stack([deploy.LOW, deploy.HIGH], axis=1), model.JOINT_LIMITS)
+    assert (deploy.KP, deploy.KD, deploy.TORQUE) == (model.KP, model.KD, second.TORQUE_LIMIT)
+    assert (deploy.ACTION_SCALE, deploy.PERIOD, deploy.EPISODE_STEPS) == (
+        env.ACTION_SCALE,
+        simulation.DECISION,
+        EPISODE_STEPS,
+    )
+
+
+def test_it_says_first_that_hardware_was_never_tried(deploy):
+    assert "NEVER TRIED ON HARDWARE" in "\n".join((EXAMPLES / "deploy_go1.py").read_text().splitlines()[:5])
+
+
+def test_a_measurement_of_gravity_is_that_of_the_task(deploy, robot):
+    robot.simulation.data.qpos[3:7] = np.array([0.8, 0.2, -0.4, 0.4])
+    robot.simulation.data.qpos[3:7] /= np.linalg.norm(robot.simulation.data.qpos[3:7])
+    np.testing.assert_allclose(robot.read().gravity, robot.simulation.motion.gravity, atol=1e-12)
+
+
+def test_it_stands_up_and_lies_down_within_all_limits(deploy, robot, policy_file):
+    recorded = Recorded(robot)
+    heights = []
+    wait = recorded.wait
+    recorded.wait = lambda: (wait(), heights.append(robot.simulation.data.qpos[2]))
+    policy = deploy.Policy(str(policy_file))
+    milliseconds = deploy.run(recorded, policy, np.zeros(3), seconds=1.0, patience=30.0)
+    assert len(milliseconds) == 50
+    assert len(heights) == 250
+    assert heights[0] < 0.12
+    assert 0.24 < min(heights[110:150]) <= max(heights[110:150]) < 0.31
+    assert heights[-1] < 0.15
+    targets = np.array([targets for targets, kp, _ in recorded.commands if kp > 0])
+    assert len(targets) == 250
+    assert (targets >= deploy.LOW).all()
+    assert (targets <= deploy.HIGH).all()
+    assert np.abs(np.diff(targets, axis=0)).max() < 0.15  # nothing jumps
+    assert recorded.commands[-1][1:] == (0.0, deploy.DAMPING)
+
+
+def test_a_policy_sees_the_observation_of_the_task(deploy, robot, policy_file):
+    policy, seen = deploy.Policy(str(policy_file)), []
+    policy.act = lambda *arguments: (seen.append((robot.simulation.motion, arguments)), np.full(12, 0.1 * len(seen)))[1]
+    command = np.array([0.3, 0.0, -0.2])
+    with deploy.Guard(robot, 30.0) as guard:
+        deploy.move(guard, deploy.HOME, 1.0)
+        deploy.walk(guard, policy, command, 3)
+    assert [timestep for _, (_, _, timestep) in seen] == [0, 1, 2]
+    assert [left for _, (_, left, _) in seen] == pytest.approx([20.0, 19.98, 19.96])
+    for step, (motion, (observation, *_)) in enumerate(seen):
+        np.testing.assert_allclose(observation, observation_of(motion, np.full(12, 0.1 * step), command), atol=1e-6)
+
+
+def test_targets_stay_within_joint_and_torque_limits(deploy, robot):
+    recorded, positions = Recorded(robot), deploy.HOME
+    with deploy.Guard(recorded, 30.0) as guard:
+        guard.send(deploy.HOME + 10.0, positions)
+        guard.send(np.full(12, -10.0), deploy.LOW + 0.1)
+    high, low = recorded.commands[0][0], recorded.commands[1][0]
+    np.testing.assert_allclose(high, np.minimum(deploy.HIGH, positions + 23.7 / 35.0))
+    np.testing.assert_allclose(low, deploy.LOW)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"orientation": np.array([0.8, 0.6, 0.0, 0.0])}, "tilted by more than 60 degrees"),
+        ({"velocities": np.full(12, 31.0)}, "faster than 30 rad/s"),
+        ({"positions": np.full(12, -3.0)}, "rad beyond its limits"),
+        ({"gyro": np.array([0.0, np.nan, 0.0])}, "not finite"),
+        ({"age": 0.05}, "50 ms old"),
+    ],
+)
+def test_what_is_beyond_a_limit_stops_the_robot(deploy, robot, changes, reason):
+    recorded = Recorded(robot, **changes)
+    with pytest.raises(deploy.StoppedError, match=reason), deploy.Guard(recorded, 30.0) as guard:
+        deploy.move(guard, deploy.HOME, 1.0)
+    assert recorded.commands[-1][1:] == (0.0, deploy.DAMPING)
+    assert all(kp == 0.0 for _, kp, _ in recorded.commands)
+
+
+def test_a_target_that_is_not_finite_is_never_sent(deploy, robot):
+    recorded = Recorded(robot)
+    with pytest.raises(deploy.StoppedError, match="target is not finite"), deploy.Guard(recorded, 30.0) as guard:
+        guard.send(np.full(12, np.nan), deploy.HOME)
+    assert all(kp == 0.0 and np.isfinite(targets).all() for targets, kp, _ in recorded.commands)
+
+
+def test_the_watchdog_stops_the_robot_while_a_policy_still_thinks(deploy, robot):
+    recorded = Recorded(robot)
+    with deploy.Guard(recorded, 0.1) as guard:
+        guard.send(deploy.HOME, deploy.HOME)
+        time.sleep(0.4)
+        during = list(recorded.commands)
+        with pytest.raises(deploy.StoppedError, match="no command came for more than 100 ms"):
+            guard.send(deploy.HOME, deploy.HOME)
+    assert [kp for _, kp, _ in during] == [deploy.KP, 0.0]
+    assert all(kp == 0.0 for _, kp, _ in recorded.commands[1:])
+
+
+def test_it_runs_as_a_command_and_names_its_milliseconds(deploy, policy_file, tmp_path):
+    model_file = write_model(tmp_path / "go1.xml")
+    command = [sys.executable, str(EXAMPLES / "deploy_go1.py"), str(policy_file), "--model-file", str(model_file)]
+    process = subprocess.run([*command, "--seconds", "1"], capture_output=True, text=True, check=False)
+    if "no command came" in process.stderr:
+        pytest.skip("the machine is too busy for a watchdog of 60 ms")
+    assert process.returncode == 0, process.stderr
+    assert "50 decisions: " in process.stdout
+    assert "at the 99th percentile" in process.stdout
+
+
+def test_it_needs_numpy_and_onnxruntime_alone(deploy):
+    program = "import sys; sys.modules.update(torch=None, gymnasium=None, sb3_dtfm=None, mujoco=None); import deploy_go1"
+    subprocess.run([sys.executable, "-c", program], cwd=EXAMPLES, check=True)
