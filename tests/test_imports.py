@@ -219,7 +219,7 @@ MISSING = {
     "record --demonstrator lift --episodes 1 --output lift.hdf5": 'pip install "sb3-dtfm[robosuite]"',
     "record --algo tqc --model a.zip --env Pendulum-v1 --episodes 1 --dataset-id my/own-v0": 'pip install "sb3-dtfm[zoo]"',
     "record --algo sac --model a.zip --env Ant-v5 --episodes 1 --dataset-id my/own-v0": 'pip install "gymnasium[mujoco]"',
-    "record --algo sac --model a.zip --env Go1Velocity-v0 --episodes 1 --dataset-id my/own-v0": 'needs MuJoCo: pip install',
+    "record --algo sac --model a.zip --env Go1Velocity-v0 --episodes 1 --dataset-id my/own-v0": "needs MuJoCo: pip install",
     "inspect no/such-v0": 'cannot be downloaded: for that, pip install "sb3-dtfm[minari]"',
     "inspect arm": 'to read Parquet and Arrow files: pip install "sb3-dtfm[minari]"',
 }
