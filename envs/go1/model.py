@@ -12,7 +12,7 @@ except ImportError as error:
     raise ImportError('Go1Velocity-v0 needs MuJoCo: pip install "sb3-dtfm[mujoco]".') from error
 
 LEGS = ("FR", "FL", "RR", "RL")
-# Of a leg: joint, link that it moves, axis, range in rad, static friction in N m, torque limit in N m, angle at home in rad.
+# The joints of a leg: name, axis, range in rad, static friction in N m, torque limit in N m, angle at home in rad.
 # The left side's hips stand at the opposite angle.
 JOINTS = (
     ("hip", (1, 0, 0), (-0.863, 0.863), 0.3, 23.7, 0.1),
@@ -113,7 +113,7 @@ def build_spec(legs: Sequence[str] = LEGS) -> mujoco.MjSpec:
 
 def add_floor(spec: mujoco.MjSpec, priority: int = 0) -> None:
     """
-    A plane, a light, and a camera that follows the trunk.
+    A plane and a light.
 
     :param spec: of the scene
     :param priority: of the floor's contact parameters over those of the feet

@@ -40,7 +40,7 @@ class SequenceModel(BaseAlgorithm):
     """
     A sequence policy with its environment: built, saved, loaded, exported. Learning is its children's.
 
-    :ivar target_return: to ask for, environment reward units; given to each environment of the model that is wrapped
+    :ivar target_return: for acting, environment reward units; given to each environment of the model that is wrapped
         without a target. None where a file does not tell
     :ivar buffer: what it learns from, None where a model only acts
     """
@@ -213,8 +213,7 @@ class SequenceModel(BaseAlgorithm):
         :param custom_objects: attributes to use in place of those in the file
         :param print_system_info: print what the file was saved with
         :param force_reset: as in SB3
-        :param allow_pickle: load files as SB3 saves them, and this package once did. That runs whatever their author wished
-            to be run: for files that you trust
+        :param allow_pickle: load files in SB3's format, whose pickles run code of their author: for files that you trust
         :param kwargs: attributes to change, `dataset` for example
         :raises ModelFileError: the file is damaged, pickled, of another algorithm, or holds what no model can have
         :raises ValueError: an attribute out of range, or an environment that does not fit

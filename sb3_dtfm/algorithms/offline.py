@@ -97,12 +97,11 @@ class OfflineAlgorithm(SequenceModel):
     Where `torch.distributed` is initialised, its processes train one model together; callbacks, logs and `save` are those
     of process 0.
 
-    :param policy: "MultiInputPolicy" (or "MlpPolicy", which is the same), or a policy class
+    :param policy: "MultiInputPolicy", "MlpPolicy" or "CnnPolicy" (all alike), or a policy class
     :param env: environment, or its Gymnasium id; optional, never used for learning. It is wrapped in
         :class:`~sb3_dtfm.envs.ReturnToGoWrapper` where it is not yet; a vectorised one has to be wrapped inside
-    :param dataset: Minari id or dataset, path to a robomimic hdf5 file or to flat arrays (`.npz`, hdf5), or what is in
-        memory: a dictionary of arrays, a list of episodes, an SB3 `ReplayBuffer`, a
-        :class:`~sb3_dtfm.data.TrajectoryBuffer`; see :func:`~sb3_dtfm.data.load_dataset`
+    :param dataset: Minari id or dataset, path of a file or folder, or data in memory; see
+        :func:`~sb3_dtfm.data.load_dataset`
     :param learning_rate: AdamW's, a number or a function of the progress remaining (from 1 to 0)
     :param batch_size: windows in a gradient step, of all processes together; by default 64 of less than 10,000 recorded
         steps, and 256 of more
@@ -125,14 +124,13 @@ class OfflineAlgorithm(SequenceModel):
     :param compile: compile the loss with `torch.compile`; None does so on a GPU, where one process starts its kernels as a
         CUDA graph. It takes a minute, and a C++ compiler
     :param policy_kwargs: arguments of the policy, for example `embed_dim`, `n_layers`, `n_heads`, `dropout`, `kv_cache`. The
-        data decide `dropout`, `chunk_size`, `flow_steps`, `regression_coef`, `timestep_embedding`, `observation_scaling`,
-        `return_conditioning` and `return_range` where they are not given, see :mod:`sb3_dtfm.data.decisions`
+        data decide some that are not given, see :mod:`sb3_dtfm.data.decisions`
     :param tensorboard_log: folder of the TensorBoard log, None for no log
     :param verbose: 0 silent, 1 prints the log
     :param seed: seed of weights, batches and acting
     :param device: "auto", "cpu" or "cuda"
     :param _init_setup_model: build the network at once
-    :ivar target_return: to ask for, environment reward units: the environment's, or where it has none the mean return of the
+    :ivar target_return: for acting, environment reward units: the environment's, or where it has none the mean return of the
         best tenth of the recorded episodes, which `sb3-dtfm inspect` suggests. It is saved with the model, and given to each
         environment of the model that is wrapped without a target. None where a file does not tell
     :raises ValueError: no dataset, an argument out of range, or an environment that does not fit

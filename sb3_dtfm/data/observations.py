@@ -18,8 +18,7 @@ ReadArray: TypeAlias = Callable[..., np.ndarray]
 
 
 STORED_AS_JPEG = (
-    "hold JPEG images, as which Minari stores arrays of bytes; images cannot be used, and vectors are read if they are "
-    "recorded as another type than uint8."
+    "hold JPEG images, as which Minari stores arrays of bytes; they are not read. Record vectors as another type than uint8."
 )
 
 
@@ -131,7 +130,7 @@ def chosen(observations: Any, keys: Sequence[str], space: spaces.Space | None, w
     :raises DatasetError: as :func:`in_space`, or there is no such entry
     """
     if not isinstance(observations, Mapping):
-        raise DatasetError(f"{where} is no dictionary, of which observation_keys could choose {', '.join(keys)}.")
+        raise DatasetError(f"{where}: observation_keys needs a dictionary, got an array; leave it out.")
     parts = []
     for key in keys:
         if key not in observations:
@@ -191,7 +190,7 @@ def check_no_images(array: np.ndarray, where: str) -> None:
     if bytes_of_images or (array.ndim == 4 and {array.shape[1], array.shape[3]} & {1, 3, 4}):
         raise DatasetError(
             f"{where} is {array.dtype} of shape {array.shape}, expected images as uint8 of (steps, height, width, "
-            "channels), 0 to 255, or vectors of numbers; of floats from 0 to 1 write (255 * images).astype(np.uint8)."
+            "channels), 0 to 255, or vectors of numbers; for floats from 0 to 1 write (255 * images).astype(np.uint8)."
         )
 
 

@@ -294,12 +294,12 @@ def check_images(
     :raises DatasetError: other cameras, sizes or numbers than bytes, or not one image a step
     """
     if image_spaces is not None and images.keys() != image_spaces.keys():
-        raise DatasetError(f"{where}: has images of {listed(images)}, and the episodes before of {listed(image_spaces)}.")
+        raise DatasetError(f"{where}: has images of {listed(images)}, expected {listed(image_spaces)} as before.")
     for camera, array in images.items():
         if array.dtype != np.uint8 or array.ndim != 4 or 0 in array.shape:
             raise DatasetError(
                 f"{where}: images of {camera!r} are {array.dtype} of shape {array.shape}, expected uint8 of (steps, height, "
-                "width, channels), 0 to 255; of floats from 0 to 1 write (255 * images).astype(np.uint8)."
+                "width, channels), 0 to 255; for floats from 0 to 1 write (255 * images).astype(np.uint8)."
             )
         if len(array) != n_steps:
             raise DatasetError(f"{where}: has {len(array)} images of {camera!r}, expected {n_steps}, one for each action.")
@@ -311,7 +311,7 @@ def check_images(
         if image_spaces is not None and array.shape[1:] != image_spaces[camera].shape:
             before = image_spaces[camera].shape
             raise DatasetError(
-                f"{where}: images of {camera!r} have shape {array.shape[1:]}, and those of the episodes before {before}."
+                f"{where}: images of {camera!r} have shape {array.shape[1:]}, expected {before} as before; resize them."
             )
 
 

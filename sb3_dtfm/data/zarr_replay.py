@@ -1,9 +1,13 @@
 """Reading the zarr replay buffers of Diffusion Policy (Chi et al., 2023) into a `TrajectoryBuffer`."""
 
 import contextlib
+import json
+import math
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +28,15 @@ from sb3_dtfm.data.flat import (
 )
 from sb3_dtfm.data.observations import observed
 from sb3_dtfm.data.storage import FileStorage
-from sb3_dtfm.data.trajectories import DatasetError, Trajectory, wrap_dataset_errors
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_size, wrap_dataset_errors
 
 SUFFIXES = (".zarr", ".zarr.zip")
 EXPECTED = "the path of a zarr replay buffer (.zarr, .zarr.zip)"
 ENDS = "meta/episode_ends"
+# Files that say how arrays are stored, and codecs that only compress: others, such as numcodecs' pickle, can run code.
+METADATA = (".zarray", ".zmetadata", "zarr.json")
+CODECS = {"blosc", "bytes", "bz2", "crc32c", "delta", "endian", "gzip", "lz4", "shuffle", "transpose", "zlib", "zstd"}
+NUMBERS = re.compile(r"[<>|]?(b|i|u|f|bool|int|uint|float)\d*")
 # A part of an array's columns: "state[:2]".
 COLUMNS = re.compile(r"(.+)\[(\d*):(\d*)\]")
 
@@ -40,7 +48,7 @@ def is_zarr(dataset: Any) -> bool:
 
 def fingerprint_zarr(path: str | os.PathLike[str], options: dict[str, Any]) -> Fingerprint:
     """
-    As it is now.
+    Of the folder or zip as it is now.
 
     :param path: the folder or zip
     :param options: of :func:`load_zarr`
@@ -65,11 +73,44 @@ def _opened(path: Path) -> Iterator[Any]:
     except ImportError as error:
         raise ImportError(f'{path} needs zarr: pip install "sb3-dtfm[zarr]"') from error
     if path.is_dir():
-        files_below(path)  # no link leads out of it
+        files = files_below(path)  # no link leads out of it
+        _check_metadata({str(file): file.read_text for file in files if file.name in METADATA})
         yield zarr.open_group(path, mode="r")
         return
+    with zipfile.ZipFile(path) as archive:
+        named = {name: partial(archive.read, name) for name in archive.namelist() if name.rpartition("/")[2] in METADATA}
+        _check_metadata({f"{path}, {name}": read for name, read in named.items()})
     with zarr.storage.ZipStore(path, mode="r") as store:
         yield zarr.open_group(store, mode="r")
+
+
+def _check_metadata(read: Mapping[str, Callable[[], str | bytes]]) -> None:
+    """
+    Refuse arrays that are no numbers, and ways to store them that could run code, before any is opened.
+
+    :param read: gives the JSON of each file, by its name for messages
+    :raises DatasetError: names the file and what it asks for
+    """
+    for where, content in read.items():
+        with wrap_dataset_errors(where):
+            found = json.loads(content())
+        for name, value in _entries(found):
+            codec = name in ("compressor", "compressors", "filters", "codecs", "serializer")
+            for each in (value if isinstance(value, list) else [value]) if codec and value is not None else ():
+                asked = each.get("id", each.get("name")) if isinstance(each, dict) else each
+                if asked not in CODECS:
+                    raise DatasetError(f"{where}: codec {asked!r}, expected one of {', '.join(sorted(CODECS))}.")
+            if name in ("dtype", "data_type") and not (isinstance(value, str) and NUMBERS.fullmatch(value)):
+                raise DatasetError(f"{where}: an array of {value!r}, expected numbers.")
+
+
+def _entries(found: Any) -> Iterator[tuple[str, Any]]:
+    """All names in JSON with their values, at any depth but within `attributes`, which are the user's own."""
+    for name, value in found.items() if isinstance(found, dict) else ():
+        yield name, value
+        if name != "attributes":
+            for each in value if isinstance(value, list) else [value]:
+                yield from _entries(each)
 
 
 def load_zarr(
@@ -105,12 +146,15 @@ def load_zarr(
     source = str(path)
     with wrap_dataset_errors(source), _opened(path) as group:
         data = dict(group["data"].arrays())
+        n_stored = path.stat().st_size if path.is_file() else sum(file.stat().st_size for file in files_below(path))
+        for name, array in data.items():
+            check_size(math.prod(array.shape) * array.dtype.itemsize, n_stored, f"{source}: {name}")
         if ENDS not in group:
             raise DatasetError(f"{source}: has no {ENDS}, which says where episodes end.")
         ends = np.asarray(group[ENDS][:])
         name = next((each for each in ACTIONS if each in data), None)
         if name is None:
-            raise DatasetError(f"{source}: data has no array one of {', '.join(ACTIONS)}, only {', '.join(sorted(data))}.")
+            raise DatasetError(f"{source}: data has no array {' or '.join(ACTIONS)}, only {', '.join(sorted(data))}.")
         n_steps = data[name].shape[0]
         if ends.ndim != 1 or not len(ends) or (np.diff(ends, prepend=0) <= 0).any() or ends[-1] != n_steps:
             raise DatasetError(f"{source}: {ENDS} is {ends}, expected ascending numbers of steps, the last one {n_steps}.")
@@ -163,5 +207,7 @@ def _read(array: Any, steps: slice, columns: slice, where: str) -> np.ndarray:
         return values if columns == slice(None) else values.reshape(len(values), -1)[:, columns]
     images = values.astype(np.uint8)
     if not (images == values).all():
-        raise DatasetError(f"{where} holds images of {values.dtype} that are no whole numbers from 0 to 255.")
+        raise DatasetError(
+            f"{where}: images of {values.dtype} hold others than whole numbers from 0 to 255; scale them and store uint8."
+        )
     return images

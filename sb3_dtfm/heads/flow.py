@@ -37,7 +37,7 @@ class FlowOptions(Options):
     :param flow_tau_exponent: tau of the loss is u to this power for u uniform in [0, 1]: above 1 it is more often near the
         noise, where the action has to come from the hidden state
     :param regression_coef: weight of the regression of the action from the hidden state; 0 leaves it out
-    :param one_step_policy: train a network that takes one evaluation for all solver steps
+    :param one_step_policy: train a network that replaces the solver by one evaluation
     :raises ValueError: an option out of range, or a way of acting that the others do not train, by name
     """
 
@@ -123,7 +123,7 @@ class FlowHead(ActionHead):
 
     @property
     def noise_decides(self) -> bool:
-        """Not without a solver's step, nor by one of Euler, which ends at the mean action from wherever it begins."""
+        """Not with 0 solver steps, nor with one of Euler, which ends at the mean action from any noise."""
         solver, n_steps = self.options.flow_solver, self.options.flow_steps
         return solver == ONE_STEP or n_steps > (1 if solver == "euler" else 0)
 

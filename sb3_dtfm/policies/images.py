@@ -12,7 +12,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureC
 from torch import nn
 from torch.nn import functional as F
 
-# Groups of a group normalisation have so many channels.
+# Channels in each group of a group normalisation.
 GROUP = 8
 
 
@@ -24,7 +24,8 @@ class ResidualExtractor(BaseFeaturesExtractor):
     :param observation_space: Box (channels, height, width)
     :param features_dim: numbers that an image becomes
     :param channels: of the first convolution and of each residual block; all but the last block halve height and width
-    :param crop: share of height and of width that is kept; 1 keeps all
+    :param crop: kept share of height and width, in (0, 1]
+    :raises ValueError: another `crop`, or fewer than two channels
     """
 
     def __init__(
@@ -35,6 +36,8 @@ class ResidualExtractor(BaseFeaturesExtractor):
         crop: float = 0.9,
     ) -> None:
         super().__init__(observation_space, features_dim)
+        if not 0.0 < crop <= 1.0 or len(channels) < 2:
+            raise ValueError(f"crop must be a number in (0, 1] and channels two or more, got {crop!r} and {channels!r}.")
         n_channels, height, width = observation_space.shape
         self.size = (round(crop * height), round(crop * width))
         self.stem = nn.Conv2d(n_channels, channels[0], kernel_size=5, stride=2, padding=2)
@@ -126,7 +129,8 @@ class ImageEncoder(nn.Module):
         self.normalize_images = normalize_images
         shapes = {space.shape for space in image_spaces.values()}
         if shared and len(shapes) > 1:
-            raise ValueError(f"share_features_extractor=True needs images of one shape, got {sorted(shapes)}.")
+            found = f"got {sorted(shapes)}; resize them or leave it out"
+            raise ValueError(f"share_features_extractor=True needs images of one shape, {found}.")
         made = self.cameras[:1] if shared else self.cameras
         self.extractors = nn.ModuleList(EXTRACTORS[extractor](image_spaces[each], **extractor_kwargs) for each in made)
         self.norms = nn.ModuleList(nn.LayerNorm(self._extractor(i).features_dim) for i in range(len(self.cameras)))

@@ -46,15 +46,15 @@ class Arguments:
 @dataclass(frozen=True)
 class PolicyOptions(Options):
     """
-    Sizes of the trunk, what it sees, and how it acts; options of the head are the head's.
+    Options of the Transformer, its inputs and its way of acting; the head has its own.
 
-    :param embed_dim: width of the trunk
+    :param embed_dim: width of the Transformer
     :param n_layers: number of Transformer blocks
     :param n_heads: attention heads
-    :param dropout: dropout probability of the trunk
+    :param dropout: dropout probability of the Transformer
     :param chunk_size: H, actions that one hidden state leads to: the newest step's and the next ones (action chunking, Zhao
         et al., 2023; Chi et al., 2023). 1 is Decision Transformer's
-    :param n_action_steps: how many of them are carried out before the policy looks again, half of them if not given
+    :param n_action_steps: actions executed before the next prediction; half of the chunk if not given
     :param return_conditioning: learn and act by the return-to-go; without it, the policy clones what was recorded
     :param expected_return_steps: n: a step's return-to-go is the rewards of n steps and the return expected after such an
         observation, so that a high target return does not stand for chance (Paster et al., 2022); 0 takes the recorded
@@ -75,12 +75,12 @@ class PolicyOptions(Options):
     :param share_features_extractor: one extractor for all cameras instead of one each
     :param timestep_embedding: tell the trunk the absolute time step, as Decision Transformer does
     :param tokens_per_step: 3, return-to-go, observation and action, as Decision Transformer does; or 1, the sum of a step's
-        return-to-go, its observation and the action before it: a third of the products
+        return-to-go, its observation and the action before it: a third of the multiply-accumulates
     :param critic_steps: with each gradient step, how many a critic takes, which learns what actions are worth so that the
         best of several can be taken, see :class:`~sb3_dtfm.policies.critic.Critic`; trunk and head learn as without. It
         needs a head that draws; 0 for no critic
     :param gamma: discount of a step for the critic
-    :param expectile: of the critic
+    :param expectile: of the critic's value loss, in [0.5, 1)
     :param n_action_samples: N of best-of-N: actions, or chunks, that are sampled, of which the critic takes one; 1 asks
         no critic
     :param sample_noise_std: standard deviation of the noise that all but the first of them start from; above 1, which the

@@ -25,7 +25,7 @@ from sb3_dtfm.envs.go1.model import KD, TIMESTEP, add_floor
 from sb3_dtfm.envs.go1.simulation import Simulation
 from sb3_dtfm.recording.onnx_agent import OnnxAgent
 
-# Forward and left in m/s, turn in rad/s; the first three are those that the must is about.
+# Forward and left in m/s, turn in rad/s; the first three are in docs/howto/go1.md.
 COMMANDS = ((1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 1.0), (1.5, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, -0.5, 0.0))
 UNITS = ("m/s", "m/s", "rad/s")
 DIRECTIONS = ("forward", "left", "turn")

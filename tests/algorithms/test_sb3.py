@@ -130,9 +130,9 @@ def test_mlp_policy_is_another_name_of_the_policy(algorithm, cheetah_buffer, tmp
 
 
 def test_a_policy_of_another_name_is_refused_with_the_names_there_are(cheetah_buffer):
-    message = r"policy must be 'MultiInputPolicy' \(or 'MlpPolicy'\), got 'CnnPolicy'"
+    message = r"policy must be 'MultiInputPolicy' \(or 'MlpPolicy', 'CnnPolicy'\), got 'RnnPolicy'"
     with pytest.raises(ValueError, match=message):
-        DT("CnnPolicy", make_env(), cheetah_buffer)
+        DT("RnnPolicy", make_env(), cheetah_buffer)
 
 
 def test_a_progress_bar_counts_gradient_steps(cheetah_buffer, capsys):

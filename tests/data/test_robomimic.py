@@ -277,11 +277,11 @@ def spoil(name, step, column, value):
         (change("dones", lambda d: d[:4]), "demo_1: dones have shape (4,), expected (6,)"),
         (
             change("obs", lambda o: {**o, "object": o["object"][:3]}),
-            "demo_1: observation 'object' has shape (3, 10), expected (6, dimensions)",
+            "demo_1: observation 'object' is float64 of shape (3, 10), expected (6, dimensions)",
         ),
         (
             change("obs", lambda o: {**o, "object": np.zeros((6, 8, 8, 3))}),
-            "demo_1: observation 'object' has shape (6, 8, 8, 3), expected (6, dimensions)",
+            "demo_1: observation 'object' is float64 of shape (6, 8, 8, 3), expected (6, dimensions)",
         ),
         (
             change("obs", lambda o: {**o, "object": o["object"][:, :3]}),

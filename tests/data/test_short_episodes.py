@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sb3_dtfm.data import DatasetError, Trajectory, TrajectoryBuffer, load_dataset
-from sb3_dtfm.data.buffer import STEP_ARRAYS
 from sb3_dtfm.data.short_episodes import LONG, blocks
+from sb3_dtfm.data.storage import STEP_ARRAYS
 
 # Short ones of several lengths, beside and between long ones.
 LENGTHS = np.array([3, 1, 1, 63, 64, 2, 200, 65, 1, 5, 5, 3])

@@ -1,5 +1,6 @@
 """The zarr replay buffers of Diffusion Policy: folders and zips, images of bytes or of whole floats, and what is refused."""
 
+import json
 import shutil
 
 import numpy as np
@@ -66,12 +67,12 @@ REFUSED = {
     "ends": (lambda arrays: arrays.update({"meta/episode_ends": np.array([3, 9])}), r"ascending .*, the last one 8"),
     "no actions": (
         lambda arrays: arrays.pop("data/action"),
-        r"data has no array one of actions, .*, only img, state",
+        r"data has no array actions or .*, only img, state",
     ),
     "steps": (lambda arrays: arrays.update({"data/state": np.zeros((4, 5))}), r"state has shape \(4, 5\), expected 8 steps"),
     "half a pixel": (
         lambda arrays: arrays["data/img"].__setitem__(0, 0.5),
-        r"episode 0: img holds images of float32",
+        r"episode 0: img: images of float32 hold others than whole",
     ),
     "NaN": (lambda arrays: arrays["data/state"].__setitem__(4, np.nan), r"episode 1, step 1"),
 }
@@ -93,3 +94,37 @@ def test_what_is_not_there_or_no_zarr_is_refused(tmp_path):
     (tmp_path / "broken.zarr.zip").write_bytes(b"PK no zip")
     with pytest.raises(DatasetError, match=r"broken\.zarr\.zip: cannot be read"):
         load_dataset(tmp_path / "broken.zarr.zip")
+
+
+SPOILED = {
+    "compressor": ({"compressor": {"id": "pickle"}}, "codec 'pickle', expected one of blosc"),
+    "filter": ({"filters": [{"id": "pickle", "protocol": 4}]}, "codec 'pickle'"),
+    "json": ({"compressor": {"id": "json2"}}, "codec 'json2'"),
+    "objects": ({"dtype": "|O"}, r"an array of '\|O', expected numbers"),
+    "records": ({"dtype": [["a", "<f4"]]}, "an array of .*, expected numbers"),
+    "size": ({"shape": [10**9, 2]}, "action claim 8000000000 bytes"),
+}
+
+
+@pytest.mark.parametrize("zipped", [False, True])
+@pytest.mark.parametrize("name", SPOILED)
+def test_nothing_that_could_run_code_or_fill_the_memory_is_opened(name, zipped, arrays, tmp_path):
+    change, message = SPOILED[name]
+    folder = write(tmp_path / "push.zarr", arrays)
+    metadata = folder / "data" / "action" / ".zarray"
+    metadata.write_text(json.dumps({**json.loads(metadata.read_text()), **change}))
+    path = folder
+    if zipped:
+        shutil.make_archive(str(folder), "zip", folder)
+        path = tmp_path / "push.zarr.zip"
+    with pytest.raises(DatasetError, match=message):
+        load_dataset(path, action_bounds=(0, 512))
+
+
+def test_the_consolidated_metadata_are_looked_at_too(arrays, tmp_path):
+    folder = write(tmp_path / "push.zarr", arrays)
+    own = json.loads((folder / "data" / "action" / ".zarray").read_text())
+    entries = {"data/action/.zarray": {**own, "compressor": {"id": "pickle"}}}
+    (folder / ".zmetadata").write_text(json.dumps({"metadata": entries, "zarr_consolidated_format": 1}))
+    with pytest.raises(DatasetError, match="zmetadata: codec 'pickle'"):
+        load_dataset(folder, action_bounds=(0, 512))

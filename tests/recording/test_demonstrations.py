@@ -117,7 +117,7 @@ def hurried(monkeypatch):
 
     def limit(horizon):
         env = RobosuiteEnv("Lift", horizon=horizon)
-        monkeypatch.setattr(demonstrations, "_environment", lambda task: env)
+        monkeypatch.setattr(demonstrations, "_environment", lambda *scene: env)
 
     return limit
 

@@ -1,4 +1,4 @@
-"""Cameras: what is recorded is what is seen, pixel by pixel, upright, and beside the arm's own numbers."""
+"""Recorded images are the observed ones, pixel by pixel, upright, and beside the arm's own numbers."""
 
 import ctypes.util
 
@@ -40,7 +40,7 @@ wrapped.close()
 """
 
 
-def test_what_is_recorded_is_what_is_seen(tmp_path, monkeypatch):
+def test_recorded_images_are_the_observed_ones(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = run_python(SEEN, MUJOCO_GL=BACKEND)
     keys = ["agentview_image", "robot0_eef_pos", "robot0_eef_quat", "robot0_eye_in_hand_image", "robot0_gripper_qpos"]
