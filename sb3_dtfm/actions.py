@@ -46,6 +46,17 @@ def from_vectors(vectors: np.ndarray, space: ActionSpace) -> np.ndarray:
     return (int(space.start) + vectors.argmax(axis=-1)).astype(space.dtype)
 
 
+def unscaled(actions: Any, low: Any, high: Any) -> Any:
+    """
+    Actions of a Box in its own range, but for rounding.
+
+    :param actions: (..., A) in [-1, 1], an array or a tensor
+    :param low: (A,), smallest action
+    :param high: (A,), largest action
+    """
+    return low + 0.5 * (actions + 1.0) * (high - low)
+
+
 def bounds_of(space: ActionSpace) -> tuple[np.ndarray, np.ndarray]:
     """
     Smallest and largest element of a space.

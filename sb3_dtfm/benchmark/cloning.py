@@ -19,7 +19,7 @@ from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 
-from sb3_dtfm.actions import vector_space
+from sb3_dtfm.actions import unscaled, vector_space
 from sb3_dtfm.benchmark.evaluation import EvaluationCallback
 from sb3_dtfm.benchmark.provenance import read_data
 from sb3_dtfm.data import TrajectoryBuffer
@@ -89,7 +89,7 @@ class Cloning:
             output = self._output(th.as_tensor(observation["observation"]))
         if isinstance(self.action_space, spaces.Discrete):
             return self.action_space.start + output.argmax(dim=1).numpy(), None
-        actions = self._low + 0.5 * (output.clamp(-1.0, 1.0) + 1.0) * (self._high - self._low)
+        actions = unscaled(output.clamp(-1.0, 1.0), self._low, self._high)
         return actions.numpy().astype(self.action_space.dtype), None
 
 

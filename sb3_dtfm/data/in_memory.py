@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from sb3_dtfm.actions import ActionSpace
+from sb3_dtfm.actions import ActionSpace, unscaled
 from sb3_dtfm.data.arrays import NUMBERS_EXPECTED
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.flat import (
@@ -390,7 +390,7 @@ def load_replay_buffer(
         seen = observed(entries, observation_keys, shown, f"{source}, {name}")
         actions = replay_buffer.actions[steps, env]
         if isinstance(space, spaces.Box):
-            actions = space.low + 0.5 * (actions.astype(np.float64) + 1.0) * (space.high - space.low)
+            actions = unscaled(actions.astype(np.float64), space.low, space.high)
         return Trajectory(
             observations=seen.vectors,
             images=seen.images,

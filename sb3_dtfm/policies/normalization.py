@@ -7,6 +7,7 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
+from sb3_dtfm.actions import unscaled
 from sb3_dtfm.transitions import Transitions
 from sb3_dtfm.windows import Windows
 
@@ -161,4 +162,5 @@ class Normalization(nn.Module):
     def unscale_action(self, action: th.Tensor) -> th.Tensor:
         """From [-1, 1] to the environment's range and no further, (..., A)."""
         low, high = self.action_low, self.action_high
-        return (low + 0.5 * (action + 1.0) * (high - low)).clamp(low, high)
+        clamped: th.Tensor = unscaled(action, low, high).clamp(low, high)
+        return clamped

@@ -13,7 +13,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_dtfm.actions import ActionSpace, from_vectors, vector_space
+from sb3_dtfm.actions import ActionSpace, from_vectors, unscaled, vector_space
 from sb3_dtfm.arguments import COUNT, NOT_NEGATIVE, check_arguments, with_nearest
 from sb3_dtfm.heads import ActionHead
 from sb3_dtfm.heads.base import NOISE_ROWS
@@ -413,7 +413,7 @@ class SequencePolicy(BasePolicy):
     def _to_environment(self, scaled_action: np.ndarray) -> np.ndarray:
         """From [-1, 1] into the action space, in its own precision."""
         low, high = self.vector_space.low, self.vector_space.high
-        action = (low + 0.5 * (scaled_action + 1.0) * (high - low)).astype(self.vector_space.dtype)
+        action = unscaled(scaled_action, low, high).astype(self.vector_space.dtype)
         return from_vectors(np.clip(action, low, high), self.action_space)
 
     def _empty_context(self, n_rows: int) -> Context:
