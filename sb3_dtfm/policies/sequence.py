@@ -462,11 +462,14 @@ class SequencePolicy(BasePolicy):
         :return: (b, H A) in [-1, 1]
         """
         rows = context.timesteps[due, -1] + context.episode_keys[due]
-        newest = Windows(*(th.from_numpy(each[due, -1:]).to(hidden.device) for each in context.windows))
         if self.takes_best_of_n:
-            samples, chosen = self._best_of_n(hidden, newest.observations[:, 0], rows, deterministic)
+            observations = th.from_numpy(context.observations[due, -1]).to(hidden.device)
+            samples, chosen = self._best_of_n(hidden, observations, rows, deterministic)
             return samples[th.arange(len(chosen), device=hidden.device), chosen]
         noise = self._acting_noise(rows, deterministic).to(hidden.device)
+        newest = None
+        if self.online_actor is not None:
+            newest = Windows(*(th.from_numpy(each[due, -1:]).to(hidden.device) for each in context.windows))
         return choose_actions(self.acting_network, self.normalization, self.online_actor, newest, hidden, noise)
 
     def _best_of_n(
@@ -590,7 +593,7 @@ def choose_actions(
     network: SequenceNetwork,
     normalization: Normalization,
     online_actor: nn.Module | None,
-    newest: Windows,
+    newest: Windows | None,
     hidden: th.Tensor,
     noise: th.Tensor,
 ) -> th.Tensor:
@@ -600,7 +603,7 @@ def choose_actions(
     :param network: that acts
     :param normalization: of the policy
     :param online_actor: of a fine-tuned model; None takes the noise and the actions as they are
-    :param newest: (B, 1, ...), the newest steps in the environment's units
+    :param newest: (B, 1, ...), the newest steps in the environment's units, for the online actor
     :param hidden: (B, D)
     :param noise: (B, N), standard normal
     :return: (B, H A) in [-1, 1]
