@@ -132,17 +132,17 @@ def total_memory(device: th.device) -> int:
 
 
 @contextlib.contextmanager
-def explain_out_of_memory(device: th.device, sizes: str, n_bytes: int = 0) -> Iterator[None]:
+def explain_out_of_memory(device: th.device, sizes: Callable[[], str], n_bytes: int = 0) -> Iterator[None]:
     """
     :param device: where training runs
-    :param sizes: the settings that decide how much is needed
+    :param sizes: tells the settings that decide how much is needed
     :param n_bytes: a batch alone takes; more than the device has are refused before an operating system ends the process
     :raises MemoryError: in place of any error of memory, with these settings
     """
     there = total_memory(device)
     if n_bytes > there:
         found = f"A batch alone takes {n_bytes / 1e9:,.1f} GB, and {device} has {there / 1e9:,.1f}"
-        raise MemoryError(f"{found}: {sizes}. Lower batch_size first.")
+        raise MemoryError(f"{found}: {sizes()}. Lower batch_size first.")
     try:
         yield
     except (MemoryError, RuntimeError) as error:
@@ -150,7 +150,7 @@ def explain_out_of_memory(device: th.device, sizes: str, n_bytes: int = 0) -> It
         if isinstance(error, RuntimeError) and not re.search("out of memory|(allocate|enough) memory", str(error), re.I):
             raise
         raise MemoryError(
-            f"A gradient step does not fit into the memory of {device}: {sizes}. Lower batch_size first."
+            f"A gradient step does not fit into the memory of {device}: {sizes()}. Lower batch_size first."
         ) from error
 
 

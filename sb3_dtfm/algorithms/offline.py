@@ -415,17 +415,17 @@ class OfflineAlgorithm(SequenceModel):
         start = time.perf_counter()
         generator = th.Generator(self.device).manual_seed(step_seed(self._training_seed, self._n_updates, NOISE))
         seed_default_generator(self.device, step_seed(self._training_seed, self._n_updates, DROPOUT, parallel.rank))
-        with explain_out_of_memory(self.device, *self._sizes()), limit_threads(self._n_macs()):
+        numbers = self.context_length * (self.policy.observation_dim + self.policy.action_dim)  # of a window
+        with explain_out_of_memory(self.device, self._sizes, 4 * self.batch_size * numbers), limit_threads(self._n_macs()):
             self._gradient_step(next(batches), generator, parallel)
         self._training_seconds += time.perf_counter() - start
         self._timed_steps += 1
 
-    def _sizes(self) -> tuple[str, int]:
-        """The arguments that decide how much memory a gradient step needs, and the bytes of a batch."""
+    def _sizes(self) -> str:
+        """The arguments that decide how much memory a gradient step needs."""
         own, sizes = self.policy.options, {"batch_size": self.batch_size, "context_length": self.context_length}
         sizes |= {"chunk_size": own.chunk_size, "embed_dim": own.embed_dim, "n_layers": own.n_layers}
-        n_numbers = self.batch_size * self.context_length * (self.policy.observation_dim + self.policy.action_dim)
-        return ", ".join(f"{name}={value}" for name, value in sizes.items()), 4 * n_numbers
+        return ", ".join(f"{name}={value}" for name, value in sizes.items())
 
     def _n_macs(self) -> int:
         """Multiplications of a gradient step, forward and twice as many backward, without attention's."""

@@ -42,7 +42,7 @@ def observed(observations: Any, keys: Sequence[str] | None, space: spaces.Space 
 
     :param observations: (T, ...), or a dictionary of such
     :param keys: entries of the dictionary, cameras too, that make up the observation, in this order; None for all
-    :param space: the environment's observation space; None where nobody tells
+    :param space: the environment's observation space; None if it is unknown
     :param where: whose they are, for messages
     :return: without vectors a single number that is always 0
     :raises DatasetError: as :func:`in_space` and :func:`chosen`
@@ -97,7 +97,7 @@ def in_space(observations: Any, space: spaces.Space | None, where: str) -> np.nd
     Observations as the vectors that the wrapper makes of them in an environment, which knows what is a choice.
 
     :param observations: as for :func:`as_vectors`
-    :param space: the environment's observation space; None where nobody tells
+    :param space: the environment's observation space; None if it is unknown
     :param where: whose they are, for messages
     :return: (T, O), with a vector of zeros and a one for each Discrete number
     :raises DatasetError: as :func:`as_vectors`, or not in the space

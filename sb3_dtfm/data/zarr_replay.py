@@ -79,6 +79,8 @@ def _opened(path: Path) -> Iterator[Any]:
         return
     with zipfile.ZipFile(path) as archive:
         named = {name: partial(archive.read, name) for name in archive.namelist() if name.rpartition("/")[2] in METADATA}
+        for name in named:
+            check_size(archive.getinfo(name).file_size, 0, f"{path}, {name}")
         _check_metadata({f"{path}, {name}": read for name, read in named.items()})
     with zarr.storage.ZipStore(path, mode="r") as store:
         yield zarr.open_group(store, mode="r")
@@ -98,19 +100,19 @@ def _check_metadata(read: Mapping[str, Callable[[], str | bytes]]) -> None:
             codec = name in ("compressor", "compressors", "filters", "codecs", "serializer")
             for each in (value if isinstance(value, list) else [value]) if codec and value is not None else ():
                 asked = each.get("id", each.get("name")) if isinstance(each, dict) else each
-                if asked not in CODECS:
+                if not isinstance(asked, str) or asked not in CODECS:
                     raise DatasetError(f"{where}: codec {asked!r}, expected one of {', '.join(sorted(CODECS))}.")
             if name in ("dtype", "data_type") and not (isinstance(value, str) and NUMBERS.fullmatch(value)):
                 raise DatasetError(f"{where}: an array of {value!r}, expected numbers.")
 
 
 def _entries(found: Any) -> Iterator[tuple[str, Any]]:
-    """All names in JSON with their values, at any depth but within `attributes`, which are the user's own."""
+    """All names in JSON with their values, at any depth: an array may be called as a part of its metadata is."""
+    for each in found if isinstance(found, list) else ():
+        yield from _entries(each)
     for name, value in found.items() if isinstance(found, dict) else ():
         yield name, value
-        if name != "attributes":
-            for each in value if isinstance(value, list) else [value]:
-                yield from _entries(each)
+        yield from _entries(value)
 
 
 def load_zarr(
@@ -147,10 +149,10 @@ def load_zarr(
     with wrap_dataset_errors(source), _opened(path) as group:
         data = dict(group["data"].arrays())
         n_stored = path.stat().st_size if path.is_file() else sum(file.stat().st_size for file in files_below(path))
-        for name, array in data.items():
-            check_size(math.prod(array.shape) * array.dtype.itemsize, n_stored, f"{source}: {name}")
         if ENDS not in group:
             raise DatasetError(f"{source}: has no {ENDS}, which says where episodes end.")
+        for name, array in {**data, ENDS: group[ENDS]}.items():
+            check_size(math.prod(array.shape) * array.dtype.itemsize, n_stored, f"{source}: {name}")
         ends = np.asarray(group[ENDS][:])
         name = next((each for each in ACTIONS if each in data), None)
         if name is None:

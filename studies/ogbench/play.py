@@ -7,7 +7,7 @@ OGBench's `play` data sets (Park et al., 2025), recorded anew by the oracles tha
 
 The file has the layout of the published ones. Its episodes have 1,001 steps: an oracle follows its plan, with noise, to a
 random target, and when it is done another target is drawn. An episode depends on its number and the seed alone. Parts lie in
-a folder beside the file until all are there, and the same command goes on after a kill.
+a folder beside the file until all are there, and the same command continues after a kill.
 """
 
 # This folder has no __init__.py, so that `import ogbench` finds the package and not the folder.
@@ -70,8 +70,8 @@ class Recorder:
         :param number: of the episode
         :return: its arrays, (1001, .) each, and `COUNTS` of the targets whose plan was followed to its end
         """
-        attempts = (self._attempt(number, attempt) for attempt in itertools.count())
-        return next(recorded for recorded in attempts if not self._task.startswith("scene") or is_visible(recorded["qpos"]))
+        episodes = (self._attempt(number, attempt) for attempt in itertools.count())
+        return next(recorded for recorded in episodes if not self._task.startswith("scene") or is_visible(recorded["qpos"]))
 
     def _attempt(self, number: int, attempt: int) -> dict[str, np.ndarray]:
         seed = int(np.random.SeedSequence((self._seed, number, attempt)).generate_state(1)[0])

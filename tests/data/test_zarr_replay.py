@@ -128,3 +128,20 @@ def test_the_consolidated_metadata_are_looked_at_too(arrays, tmp_path):
     (folder / ".zmetadata").write_text(json.dumps({"metadata": entries, "zarr_consolidated_format": 1}))
     with pytest.raises(DatasetError, match="zmetadata: codec 'pickle'"):
         load_dataset(folder, action_bounds=(0, 512))
+
+
+def test_an_array_called_attributes_is_looked_at_as_any_other(arrays, tmp_path):
+    """In the consolidated metadata of zarr's third format its name stands where a user's attributes do elsewhere."""
+    folder = write(tmp_path / "push.zarr", arrays)
+    hidden = {"attributes": {"codecs": [{"name": "numcodecs.pickle"}], "data_type": "float32"}}
+    (folder / "zarr.json").write_text(json.dumps({"consolidated_metadata": {"metadata": hidden}}))
+    with pytest.raises(DatasetError, match=r"zarr\.json: codec 'numcodecs\.pickle'"):
+        load_dataset(folder, action_bounds=(0, 512))
+
+
+def test_ends_that_claim_more_than_is_stored_are_refused(arrays, tmp_path):
+    folder = write(tmp_path / "push.zarr", arrays)
+    metadata = folder / "meta" / "episode_ends" / ".zarray"
+    metadata.write_text(json.dumps({**json.loads(metadata.read_text()), "shape": [10**10]}))
+    with pytest.raises(DatasetError, match="meta/episode_ends claim 80000000000 bytes"):
+        load_dataset(folder, action_bounds=(0, 512))

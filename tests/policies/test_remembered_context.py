@@ -183,3 +183,13 @@ def test_of_parallel_environments_one_may_be_asked_again_while_another_goes_on(m
         pair = {key: np.stack([ours[i][key], theirs[j][key]]) for key in ours[i]}
         assert np.allclose(act(model, pair), [expected[0][i], expected[1][j]], atol=1e-4), (i, j)
     assert hints() == []
+
+
+def test_the_remembered_context_is_read_only_for_callers(model):
+    """Writing into the state that a call without `state` returned would change the next action."""
+    env = make_env()
+    observation, _ = env.reset(seed=0)
+    _, state = model.predict(observation, deterministic=True)
+    for array in state:
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 0
