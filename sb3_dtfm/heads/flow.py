@@ -34,6 +34,8 @@ class FlowOptions(Options):
     :param flow_hidden_dim: width of the vector field's hidden layers
     :param flow_n_layers: number of its hidden layers
     :param flow_prediction: what the head learns of the path: its "velocity", or the "action" it leads to
+    :param flow_draws: noises and times that each step is trained with; more than one where an encoder of images, which all
+        of them share, costs most of a gradient step
     :param flow_tau_exponent: tau of the loss is u to this power for u uniform in [0, 1]: above 1 it is more often near the
         noise, where the action has to come from the hidden state
     :param regression_coef: weight of the regression of the action from the hidden state; 0 leaves it out
@@ -46,6 +48,7 @@ class FlowOptions(Options):
     flow_hidden_dim: int = option(128, COUNT)
     flow_n_layers: int = option(3, COUNT)
     flow_prediction: str = option("action", Choice(("velocity", "action")))
+    flow_draws: int = option(1, COUNT)
     flow_tau_exponent: float = option(2.0, POSITIVE)
     regression_coef: float = option(1.0, NOT_NEGATIVE)
     one_step_policy: bool = option(False, BOOLEAN)
@@ -128,8 +131,8 @@ class FlowHead(ActionHead):
         return solver == ONE_STEP or n_steps > (1 if solver == "euler" else 0)
 
     def draw_noise(self, actions: th.Tensor, generator: th.Generator) -> tuple[th.Tensor, ...]:
-        batch_size, context_length = actions.shape[:2]
-        noise = th.randn(actions.shape, generator=generator, device=actions.device)
+        batch_size, context_length = self.options.flow_draws * actions.shape[0], actions.shape[1]
+        noise = th.randn(batch_size, *actions.shape[1:], generator=generator, device=actions.device)
         start = th.rand((), generator=generator, device=actions.device)
         rows = th.linspace(0, 1, batch_size + 1, device=actions.device)[:-1, None]
         turns = th.linspace(0, 1, TAUS_PER_WINDOW + 1, device=actions.device)[:-1]
@@ -139,14 +142,16 @@ class FlowHead(ActionHead):
         self, hidden: th.Tensor, actions: th.Tensor, mask: th.Tensor, *noise: th.Tensor
     ) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         starts, tau = noise
-        loss = self.flow_loss(hidden.detach() if self.options.regression_coef else hidden, actions, mask, starts, tau)
+        learned = hidden.detach() if self.options.regression_coef else hidden
+        drawn = (th.cat([each] * self.options.flow_draws) for each in (learned, actions, mask))
+        loss = self.flow_loss(*drawn, starts, tau)
         parts = {"flow_loss": loss}
         if self.options.regression_coef:
             assert self.regression is not None
             regression_loss, regression_parts = self.regression.loss(hidden, actions, mask)
             loss, parts = loss + self.options.regression_coef * regression_loss, {**parts, **regression_parts}
         if self.one_step_policy is not None:
-            parts["one_step_loss"] = self.one_step_loss(hidden[:, -1], mask[:, -1], starts[:, -1])
+            parts["one_step_loss"] = self.one_step_loss(hidden[:, -1], mask[:, -1], starts[: len(hidden), -1])
             loss = loss + parts["one_step_loss"]
         return loss, parts
 

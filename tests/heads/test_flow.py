@@ -57,6 +57,21 @@ def test_the_loss_is_the_mean_over_valid_steps(prediction):
     th.testing.assert_close(head.flow_loss(hidden, actions, mask, noise, tau), th.stack(by_hand).mean())
 
 
+def test_several_draws_are_the_mean_of_single_ones_and_share_the_hidden_state():
+    head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_draws=3, regression_coef=0.0)
+    nn.init.normal_(head.vector_field.output.weight)
+    hidden, actions, mask = th.randn(5, 2, 4, requires_grad=True), th.rand(5, 2, 2), th.rand(5, 2) < 0.7
+    noise, tau = head.draw_noise(actions, th.Generator().manual_seed(0))
+    assert (noise.shape, tau.shape) == ((15, 2, 2), (15, 2))
+    assert tau.view(3, 5, 2)[:, :, 0].sqrt().sort(dim=0).values.diff(dim=0).min() > 0.1  # of a row, far from each other
+    single = [head.flow_loss(hidden, actions, mask, *each) for each in zip(noise.split(5), tau.split(5), strict=True)]
+    expected = th.stack(single).mean()
+    loss, _ = head.loss(hidden, actions, mask, noise, tau)
+    th.testing.assert_close(loss, expected)
+    gradients = [th.autograd.grad(each, hidden, retain_graph=True)[0] for each in (loss, expected)]
+    th.testing.assert_close(*gradients)
+
+
 def test_taus_are_spread_evenly_from_a_random_start_and_taken_in_turn():
     head = FlowHead(embed_dim=4, action_dim=2, flow_hidden_dim=8, flow_tau_exponent=1.0)
     generator = th.Generator().manual_seed(0)
