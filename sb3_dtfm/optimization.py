@@ -52,7 +52,7 @@ def choose_precision(network: nn.Module, n_rows: int, device: th.device, n_proce
     What the precision "auto" is, and why: bfloat16 where the hardware multiplies in it, on a CPU only if that is faster than
     float32 for the network's own products, which are timed once for each process.
 
-    :param network: its linear layers count
+    :param network: its linear layers and convolutions count, these as products of the weights that an output needs
     :param n_rows: rows that a gradient step multiplies by a weight
     :param device: where training runs
     :param n_processes: that train together, and would each measure for themselves
@@ -64,7 +64,7 @@ def choose_precision(network: nn.Module, n_rows: int, device: th.device, n_proce
         return "float32", f"Matrix products are in float32: this {device.type} has no instructions for bfloat16."
     if device.type == "cuda":
         return "bfloat16", "Matrix products are in bfloat16, which this GPU has instructions for."
-    weights = (layer.weight for layer in network.modules() if isinstance(layer, nn.Linear))
+    weights = [layer.weight.flatten(1) for layer in network.modules() if isinstance(layer, nn.Linear | nn.Conv2d)]
     shapes = tuple(sorted({(weight.shape[0], weight.shape[1]) for weight in weights}))
     ms = {name: products_ms(name, shapes, min(n_rows, TIMED_ROWS), th.get_num_threads()) for name in PRECISIONS[1:]}
     fastest = min(ms, key=lambda name: ms[name])

@@ -20,6 +20,8 @@ EXPECTED_RETURN_STEPS = 50
 SIGNIFICANT = 2.0
 # Recorded steps below which batches are small.
 FEW_STEPS = 10_000
+# Noises and times of the flow for each encoded image.
+FLOW_DRAWS = 8
 # Correlation of an action's successive changes below which actions are noisy.
 NOISY = -0.3
 # Recorded steps for each dimension of the observation below which there is dropout, and how much of it.
@@ -46,7 +48,7 @@ def decide(buffer: TrajectoryBuffer) -> list[Decision]:
     """
     errors = prediction_errors(buffer)
     by_return = _by_return(errors)
-    decisions = [_batch_size(buffer), _dropout(buffer), *by_return]
+    decisions = [*_batch_size(buffer), _dropout(buffer), *by_return]
     if all(each.value for each in by_return):
         decisions += _by_reward(buffer)
     if isinstance(buffer.action_space, spaces.Box):
@@ -80,11 +82,17 @@ def sentences(decisions: list[Decision]) -> list[str]:
     return [f"{reason} So {', '.join(named)}." for reason, named in settings.items()]
 
 
-def _batch_size(buffer: TrajectoryBuffer) -> Decision:
-    """Large batches overfit small datasets: ten demonstrations of Lift, 46 % success by batches of 256, 82 to 88 % by 64."""
+def _batch_size(buffer: TrajectoryBuffer) -> list[Decision]:
+    """
+    Large batches overfit small datasets: ten demonstrations of Lift, 46 % success by batches of 256, 82 to 88 % by 64. With
+    images the encoder costs most of a gradient step: small batches, whose images are used for several draws of the flow.
+    """
+    if buffer.image_spaces:
+        reason = f"Observations hold images ({', '.join(buffer.image_spaces)}), which cost most of a gradient step."
+        return [Decision("batch_size", 64, reason), Decision("flow_draws", FLOW_DRAWS, reason)]
     few = len(buffer) < FEW_STEPS
     reason = f"There are {len(buffer):,} recorded steps, {'fewer' if few else 'not fewer'} than {FEW_STEPS:,}."
-    return Decision("batch_size", 64 if few else 256, reason)
+    return [Decision("batch_size", 64 if few else 256, reason)]
 
 
 def _dropout(buffer: TrajectoryBuffer) -> Decision:

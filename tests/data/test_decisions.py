@@ -5,7 +5,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
-from sb3_dtfm import DTFM
+from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.data.decisions import decide, sentences
 from sb3_dtfm.data.predictability import correlation_of_changes, prediction_errors
@@ -148,3 +148,22 @@ def test_people_are_told_each_reason_once():
     assert told[0] == "There are 800 recorded steps, fewer than 10,000. So batch_size=64."
     assert sum("chunk_size=8" in sentence for sentence in told) == 1
     assert len(told) == 5
+
+
+def test_images_are_learned_in_small_batches_by_several_draws_each():
+    random = np.random.default_rng(0)
+    episodes = [
+        {
+            "observations": {"camera": random.integers(0, 256, (20, 16, 16, 3), np.uint8), "gripper": random.random((20, 2))},
+            "actions": random.uniform(-1.0, 1.0, (20, 2)),
+            "rewards": np.zeros(20),
+            "terminated": True,
+        }
+        for _ in range(4)
+    ]
+    small = {"features_extractor_kwargs": {"features_dim": 8}}
+    model = DTFM("MultiInputPolicy", dataset=episodes, policy_kwargs=small)
+    assert (model.batch_size, model.policy.network.head.options.flow_draws) == (64, 8)
+    assert any("camera" in sentence and "flow_draws=8" in sentence for sentence in sentences(model.decisions))
+    assert DTFM("MultiInputPolicy", dataset=episodes, batch_size=4, policy_kwargs=small).batch_size == 4
+    assert "flow_draws" not in {each.name for each in DT("MultiInputPolicy", dataset=episodes, policy_kwargs=small).decisions}
