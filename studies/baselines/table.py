@@ -85,25 +85,24 @@ def short_table(folder: Path) -> Iterable[Sequence[str]]:
 
 
 def suite_table(folder: Path, suite: Path) -> Iterable[Sequence[str]]:
-    """Lines of DT and DTFM by the classes' defaults and by the settings before them, and of the best other algorithm."""
+    """Lines of DT and DTFM by the classes' defaults, and of the best other algorithm."""
     cells, datasets, algorithms = read(folder)
     defaults: Cells = {}
     for group in (group for study in read_studies([suite]) for group in study.groups):
         for (task, _, algo), runs in group.runs.items():
             defaults.setdefault((task, algo), []).extend(runs)
-    yield "data", "DT", "DTFM", "DT before", "DTFM before", "best of the others"
+    yield "data", "DT", "DTFM", "best of the others"
     for name in datasets:
         ours = [defaults.get((IN_SUITE.get(name, name), algo)) for algo in ("dt", "dtfm")]
         if not any(ours):
             continue
-        before = [cells.get((name, algo)) for algo in ("dt", "dtfm")]
         others = {
             algo: cells[name, algo]
             for algo in algorithms
             if algo.partition(",")[0] not in ALGORITHMS and (name, algo) in cells
         }
         best = max(others, key=lambda algo: float(np.mean([run.value("final") for run in others[algo]])))
-        yield name, *(result(runs) if runs else NONE for runs in (*ours, *before)), f"{best}: {result(others[best])}"
+        yield name, *(result(runs) if runs else NONE for runs in ours), f"{best}: {result(others[best])}"
 
 
 def main() -> None:

@@ -338,11 +338,11 @@ def test_the_picture_shows_all_rows(tmp_path, monkeypatch):
 
 
 def test_the_page_says_what_the_rows_say():
-    header, *lines = table.long_table(ROOT / "results" / "baselines.csv")
-    shown = [dict(zip(header, line, strict=True)) for line in lines]
-    columns = ("data", "algorithm", "final", "minutes", "gradient steps", "ms an action")
     page = (ROOT / "docs" / "studies" / "baselines.md").read_text()
-    assert "\n".join(f"| {' | '.join(row[each] for each in columns)} |" for row in shown) in page
+    header, *lines = table.short_table(ROOT / "results" / "baselines.csv")
+    assert len(lines) == 10
+    for line in (header, *lines):
+        assert f"\n| {' | '.join(line)} |" in page
 
 
 def test_the_page_shows_the_defaults_beside_the_other_libraries():
