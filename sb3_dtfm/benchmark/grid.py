@@ -23,7 +23,7 @@ from sb3_dtfm.benchmark.settings import (
     task_settings,
 )
 from sb3_dtfm.data.inspection import suggested_target_return
-from sb3_dtfm.zoo.arguments import UsageError, asked_for, asking_for, import_packages
+from sb3_dtfm.zoo.arguments import UsageError, find_target_return, import_packages, with_target_return
 
 N_EVALUATIONS = 10  # of a run, unless --eval-freq says otherwise
 # What --algo takes.
@@ -163,14 +163,17 @@ def plan(options: argparse.Namespace) -> tuple[list[Job], list[Cell]]:
     # Seeds outermost: a grid that is cut short has seen every task.
     for seed, task, regime in product(options.seeds, read_tasks(options), options.fractions):
         for algo, wanted in _settings(task, regime, options).items():
-            cell, asks = Cell(task.name, regime, algo, seed, profile, options.label), asked_for(wanted.get("env_wrapper"))
+            cell, target = (
+                Cell(task.name, regime, algo, seed, profile, options.label),
+                find_target_return(wanted.get("env_wrapper")),
+            )
             if (rows := Path(options.results) / f"{cell.file_name}.jsonl") in files and cell not in finished:
                 raise UsageError(f"{cell}: {rows} is there, without a final evaluation of this cell; move it away.")
-            if (cell not in finished or asks is None) and (task.name, regime) not in looked_at:
+            if (cell not in finished or target is None) and (task.name, regime) not in looked_at:
                 looked_at[task.name, regime] = _look_at(task, wanted)
-            if asks is None:
+            if target is None:
                 suggested = looked_at[task.name, regime][1]
-                wanted["env_wrapper"] = asking_for(suggested, wanted.get("env_wrapper"))
+                wanted["env_wrapper"] = with_target_return(suggested, wanted.get("env_wrapper"))
             if cell in finished:
                 _check_same(cell, finished[cell], wanted, options)
                 done.append(cell)
@@ -197,7 +200,7 @@ def _settings(task: Task, regime: float, options: argparse.Namespace) -> dict[st
 
 def _look_at(task: Task, settings: dict[str, Any]) -> tuple[dict[str, Any], float]:
     """
-    What the rows say of a task's data, and the return to ask for that a run's share of them suggests.
+    What the rows say of a task's data, and the target return that a run's share of them suggests.
 
     :raises DatasetError: they cannot be read, or are of another task
     :raises UsageError: the environment cannot be made

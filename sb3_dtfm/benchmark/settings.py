@@ -11,7 +11,7 @@ import yaml
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.rows import BASELINES
-from sb3_dtfm.zoo.arguments import UsageError, asking_for
+from sb3_dtfm.zoo.arguments import UsageError, with_target_return
 from sb3_dtfm.zoo.registration import packaged_config, policy_of, with_policy_options
 
 PROFILES = {"default": None, "paper": "paper"}
@@ -31,7 +31,7 @@ CLONING = {"n_timesteps": 5000, "batch_size": 256, "learning_rate": 1e-3, "hidde
 
 class Task(NamedTuple):
     """
-    What a user asks for one task beside the profile: an entry of the file of `--datasets`.
+    A user's settings of one task beside the profile: an entry of the file of `--datasets`.
 
     :param name: of the task with its data, by which rows and reports know it
     :param dataset: Minari id, robomimic file or flat arrays, None for the profile's
@@ -126,7 +126,7 @@ def task_settings(
     """
     settings = read_profile(profile, algo, task.env_id)
     if task.dataset is not None and "dataset" in settings:  # to which the target return belongs
-        settings["env_wrapper"] = asking_for(None, settings.get("env_wrapper"))
+        settings["env_wrapper"] = with_target_return(None, settings.get("env_wrapper"))
     hyperparams = with_policy_options(hyperparams)
     policy_kwargs = {**_mapping(settings, "policy_kwargs"), **_mapping(hyperparams, "policy_kwargs")}
     merged = {key: {**_mapping(settings, key), **getattr(task, key), **_mapping(hyperparams, key)} for key in MERGED}
@@ -140,7 +140,7 @@ def task_settings(
     if task.dataset is not None:
         settings["dataset"] = task.dataset
     if task.target_return is not None:
-        settings["env_wrapper"] = asking_for(task.target_return, settings.get("env_wrapper"))
+        settings["env_wrapper"] = with_target_return(task.target_return, settings.get("env_wrapper"))
     if n_timesteps is not None:
         settings["n_timesteps"] = n_timesteps
     needed = {"dataset": "--dataset", "n_timesteps": "--n-timesteps"}

@@ -19,7 +19,7 @@ examples:
 The file of --datasets maps a task to its dataset, or to some of these keys:
   task            Gymnasium id, where the entry has a name of its own: several entries may have the same task
   dataset         Minari id, robomimic file or flat arrays; the profile's by default
-  target_return   to ask for, in reward units; what `sb3-dtfm inspect` suggests of the dataset by default
+  target_return   in reward units; what `sb3-dtfm inspect` suggests of the dataset by default
   recorded_from   the agent or demonstrator, for the report
   env_kwargs      of the environment
   dataset_kwargs  of the dataset's reader: clip_actions, action_bounds and others
@@ -66,7 +66,7 @@ def benchmark_parser() -> argparse.ArgumentParser:
     data("--dataset", **several, metavar="TASK=DATASET", help="Minari id, robomimic file or flat arrays")
     data("--datasets", metavar="FILE", help="YAML file that says the same for many tasks, see below")
     data("--dataset-cache", metavar="DIR", help="learn from memory-mapped files made in this folder")
-    data("--target-return", **several, metavar="[TASK=]RETURN", help="to ask for when acting, in reward units")
+    data("--target-return", **several, metavar="[TASK=]RETURN", help="when acting, in reward units")
     training = parser.add_argument_group("training and evaluation").add_argument
     training("-n", "--n-timesteps", type=int, metavar="N", help="gradient steps; the profile's by default")
     training("-params", "--hyperparams", **several, metavar="KEY:VALUE", help="settings to change; needs --label")

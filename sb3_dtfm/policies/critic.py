@@ -26,8 +26,8 @@ STD_SHARE = 0.01
 
 class Critic(nn.Module):
     """
-    Implicit Q-learning (Kostrikov et al., 2022): values of observations and actions, without asking about an action that
-    nobody took.
+    Implicit Q-learning (Kostrikov et al., 2022): values of observations and actions, without a value of any action that
+    was not recorded.
 
     V(s) is an expectile of Q(s, a) over the data's actions, above their mean: what a good one of them leads to. Q(s, a) is
     the reward and the discounted V of the next observation. Of two Qs the smaller one counts.

@@ -32,7 +32,7 @@ class Settings(NamedTuple):
 
     :param algo: a key of `ALGORITHMS`
     :param env: Gymnasium id
-    :param target_return: to ask for, in reward units
+    :param target_return: in reward units
     :param env_kwargs: of ``gymnasium.make``, values of JSON
     """
 
@@ -113,7 +113,7 @@ class Result(NamedTuple):
 
 def target_return_of(hyperparams: Mapping[str, Any]) -> float:
     """
-    What a run asks for. RL-Zoo imports and calls what `env_wrapper` names, so a repository says no more than this number.
+    A run's target return. RL-Zoo imports and calls what `env_wrapper` names, so a repository holds this number alone.
 
     :param hyperparams: of the run
     :raises UsageError: it acts behind another wrapper
@@ -154,7 +154,7 @@ def write_card(
     env_kwargs = f", **{settings.env_kwargs!r}" if settings.env_kwargs else ""
     text = f"""
 # {algorithm} on {settings.env}
-Trained by offline reinforcement learning, with sb3-dtfm on Stable-Baselines3. In {result.n_episodes} episodes that ask for a
+Trained by offline reinforcement learning, with sb3-dtfm on Stable-Baselines3. In {result.n_episodes} episodes with a target
 return of {settings.target_return:g} it reached {result.mean_reward:.2f} ± {result.std_reward:.2f} (standard deviation).
 {f"[Video]({VIDEO})" if has_video else ""}
 

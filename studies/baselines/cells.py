@@ -34,7 +34,7 @@ class Data(NamedTuple):
     :param task: Gymnasium id
     :param kind: one of `KINDS`
     :param dataset: Minari id, robomimic file or flat arrays
-    :param target_return: asked for when acting, in reward units
+    :param target_return: when acting, in reward units
     :param minutes: of a baseline's training on one core
     :param fraction: share of the episodes to learn from
     :param n_timesteps: our gradient steps, None for the profile's

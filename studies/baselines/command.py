@@ -91,7 +91,7 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
 
 def choose(names: Sequence[str] | None, known: Sequence[str], option: str) -> list[str]:
     """
-    :param names: asked for, None for all
+    :param names: the user's, None for all
     :raises UsageError: one is not known
     """
     if unknown := [name for name in names or () if name not in known]:
@@ -99,11 +99,11 @@ def choose(names: Sequence[str] | None, known: Sequence[str], option: str) -> li
     return list(known if names is None else dict.fromkeys(names))
 
 
-def ready(data: Data, asked_for: bool) -> bool:
+def ready(data: Data, named: bool) -> bool:
     """
     Whether the task is installed and the data can be read.
 
-    :param asked_for: by name; what nobody asked for is left out where its task's package is missing, and said so
+    :param named: the user named it; otherwise it is left out, with a message, if its task's package is missing
     :raises UsageError: a package is missing, or the dataset
     """
     if data.kind not in KINDS:
@@ -111,7 +111,7 @@ def ready(data: Data, asked_for: bool) -> bool:
     try:
         import_packages(data.gym_packages)
     except UsageError as error:
-        if asked_for:
+        if named:
             raise
         print(f"{data.name}: left out. {error}")
         return False
@@ -224,7 +224,7 @@ def main(argv: Sequence[str]) -> None:
     )
     check_workers(baselines, options)
     names = choose(options.data, list(known_data), "--data")
-    chosen = [known_data[name] for name in names if ready(known_data[name], asked_for=options.data is not None)]
+    chosen = [known_data[name] for name in names if ready(known_data[name], named=options.data is not None)]
     n_left = 0
     for seed in dict.fromkeys(options.seeds):  # outermost: a run that is cut short has seen all data
         for data in chosen:

@@ -24,7 +24,7 @@ from sb3_dtfm.cli.main import main
 from sb3_dtfm.data import load_dataset
 from sb3_dtfm.data.inspection import suggested_target_return
 from sb3_dtfm.heads import FlowHead
-from sb3_dtfm.zoo.arguments import UsageError, asked_for, asking_for
+from sb3_dtfm.zoo.arguments import UsageError, find_target_return, with_target_return
 from tests.recorded import DATASET_ID
 
 TASK = "HalfCheetah-v5"
@@ -296,17 +296,17 @@ def test_what_the_command_says_of_data_and_environment_goes_before_the_entry_key
         "fraction": 0.67,
         "fraction_seed": 0,
     }
-    assert asked_for(job.settings["env_wrapper"]) == 9.0
+    assert find_target_return(job.settings["env_wrapper"]) == 9.0
 
 
 def test_the_data_suggest_a_return_to_ask_for_where_nobody_names_one(suite, workplace):
     """Nor the profile's is taken, which belongs to its own dataset."""
     (workplace / "tiny.yml").write_text(
-        yaml.safe_dump({"default": {**SETTINGS, "dataset": "their/own-v0", "env_wrapper": asking_for(7.0, [])}})
+        yaml.safe_dump({"default": {**SETTINGS, "dataset": "their/own-v0", "env_wrapper": with_target_return(7.0, [])}})
     )
     jobs, _ = plan(parse_arguments([*suite, "--env", "whole", "--fractions", "1", "0.4"]))
     buffer = load_dataset(DATASET_ID, max_episode_steps=10)
-    asked = {job.cell.regime: asked_for(job.settings["env_wrapper"]) for job in jobs}
+    asked = {job.cell.regime: find_target_return(job.settings["env_wrapper"]) for job in jobs}
     shares = {regime: suggested_target_return(buffer.random_fraction(regime, 0)) for regime in (1.0, 0.4)}
     assert asked == shares
     assert jobs[0].data["best_return"] == pytest.approx(buffer.episode_returns.max(), abs=1e-3)
