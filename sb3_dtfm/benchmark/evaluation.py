@@ -23,7 +23,7 @@ from sb3_dtfm.zoo.comparison import RandomActions
 # First seeds of the two sets of initial states: apart from each other, and from those of recordings, which count from 0.
 TRAINING_STATES = 1_000_000
 FINAL_STATES = 2_000_000
-# What a cell prints for the grid that reads its output: steps done, steps in all, what it is doing.
+# A run prints these for the grid that reads its output: steps done, steps in all, what it is doing.
 PROGRESS = re.compile(r"step (\d+) of (\d+): (.*)\n")
 PROGRESS_INTERVAL = 0.5  # seconds
 TIMED_BLOCKS, TIMED_ACTIONS = 8, 16
@@ -175,7 +175,7 @@ class EvaluationCallback(BaseCallback):
     A YAML file of RL-Zoo may name it under `callback:`; all arguments are plain data.
 
     :param rows: JSONL file to append to
-    :param row: what all rows say: the cell, `settings` and `data`, see :mod:`~sb3_dtfm.benchmark.rows`
+    :param row: what all rows say: the run, `settings` and `data`, see :mod:`~sb3_dtfm.benchmark.rows`
     :param eval_freq: gradient steps between two evaluations
     :param n_episodes: episodes of each
     :param n_final_episodes: episodes of the last one, on the other initial states
@@ -268,7 +268,7 @@ class EvaluationCallback(BaseCallback):
 
     def _report(self, what: str) -> None:
         """
-        Say how far the cell is. Where the grid that reads it is gone, the pipe is broken, and the cell ends with it.
+        Say how far the run is. Where the grid that reads it is gone, the pipe is broken, and the run ends with it.
 
         :raises BrokenPipeError: nobody would take the rows
         """

@@ -1,4 +1,4 @@
-"""Settings of a profile for one cell: what RL-Zoo's `train` reads from its YAML file."""
+"""Settings of a profile for one run: what RL-Zoo's `train` reads from its YAML file."""
 
 import copy
 import inspect
@@ -110,7 +110,7 @@ def task_settings(
     profile: str, algo: str, task: Task, regime: float, n_timesteps: int | None, hyperparams: dict[str, Any]
 ) -> dict[str, Any]:
     """
-    Everything that RL-Zoo's `train` is to read for one cell, but the seed.
+    Everything that RL-Zoo's `train` is to read for one run, but the seed.
 
     Settings that only another algorithm knows are left out, so that one file or one `-params` serves all.
 
@@ -157,7 +157,7 @@ def task_settings(
 
 def cloning_settings(algo: str, settings: Mapping[str, Any], n_timesteps: int | None) -> dict[str, Any]:
     """
-    What a cell of behaviour cloning is to read.
+    What a run of behaviour cloning is to read.
 
     :param algo: one of `BASELINES`
     :param settings: of DT or DTFM, whose data and environment are its own, too
