@@ -16,7 +16,7 @@ from sb3_dtfm.benchmark.rows import BASELINES, Row, RunKey, read_rows
 from sb3_dtfm.benchmark.settings import (
     GRID_DATASET_KEYS,
     Task,
-    check_same_trunk,
+    check_same_transformer,
     cloning_settings,
     profile_name,
     read_yaml,
@@ -193,7 +193,7 @@ def _settings(task: Task, regime: float, options: argparse.Namespace) -> dict[st
         algo: task_settings(options.profile, algo, task, regime, options.n_timesteps, options.hyperparams)
         for algo in ALGORITHMS
     }
-    check_same_trunk(own, task.name)
+    check_same_transformer(own, task.name)
     cloning = {algo: cloning_settings(algo, own["dt"], options.n_timesteps) for algo in BASELINES}
     return {algo: {**own, **cloning}[algo] for algo in options.algos if algo in (task.algorithms or options.algos)}
 

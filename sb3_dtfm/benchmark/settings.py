@@ -168,7 +168,7 @@ def cloning_settings(algo: str, settings: Mapping[str, Any], n_timesteps: int | 
     return {**shared, **CLONING, **asked, "best_share": BASELINES[algo]}
 
 
-def check_same_trunk(settings: dict[str, dict[str, Any]], task: str) -> None:
+def check_same_transformer(settings: dict[str, dict[str, Any]], task: str) -> None:
     """
     Algorithms may differ in what not all of them know, and in nothing else.
 

@@ -81,10 +81,10 @@ def main(argv: Sequence[str]) -> None:
     picture = draw(curves, returns, Path(options.output), options.env)
     numbers = picture.with_suffix(".json")
     origin = {"task": options.env, "dataset": options.dataset, "acting": acting, "first_state": first_state(options)}
-    models = {name: [each._asdict() for each in reached] for name, reached in curves.items()}
+    numbers_of = {name: [each._asdict() for each in reached] for name, reached in curves.items()}
     with replacing(numbers) as beside:
         beside.write_text(
-            json.dumps({**origin, "commit": commit(), "versions": versions(), "models": models}, indent=1) + "\n"
+            json.dumps({**origin, "commit": commit(), "versions": versions(), "models": numbers_of}, indent=1) + "\n"
         )
     print(f"\nPicture: {picture}\nReturns of all episodes: {numbers}")
 

@@ -142,7 +142,7 @@ def _kind_of_actor(errors: PredictionErrors | None, correlation: float) -> list[
     """Settings that depend on whether previous action or observation predicts actions better."""
     ratio = None if errors is None else errors.plan_ratio()
     plans = ratio is not None and ratio > 1.0
-    # The trunk learns by the loss of what acts: the flow's, or the regression's.
+    # The Transformer learns by the loss of what acts: the flow's, or the regression's.
     flow = {"flow_steps": FLOW_STEPS if plans else 0, "regression_coef": 0.0 if plans else 1.0}
     # Scripts depend on the time step: it raised success on Lift from 34 to 46 %, ten demonstrations and batches of 256.
     settings = {"chunk_size": CHUNK_SIZE if plans else 1, **flow, "timestep_embedding": plans}

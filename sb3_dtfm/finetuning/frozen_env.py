@@ -24,7 +24,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
     One step is one decision of a frozen DTFM, of which somebody else chooses something.
 
     What is observed is one vector, in the units of the model's training data and clipped at 10: the environment's
-    observation, the return-to-go as the trunk gets it and the time step; with `hidden_state` also the trunk's hidden state,
+    observation, the return-to-go as the Transformer gets it and the time step; with `hidden_state` also its hidden state,
     which has seen the steps before.
 
     The model is left as it is: its weights, the context that its own `predict` remembers, and its random numbers.
@@ -32,7 +32,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
     :param venv: environments wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
     :param model: a DTFM, or the path to a saved one
     :param bound: how far the choice may go
-    :param hidden_state: show the trunk's hidden state as well
+    :param hidden_state: show the Transformer's hidden state as well
     :raises ValueError: a model that has an online actor already or does not fit, environments that do not fit, or an
         argument out of range
     """

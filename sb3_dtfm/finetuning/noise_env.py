@@ -50,7 +50,7 @@ class NoiseActionVecEnv(FrozenPolicyVecEnv):
     :param venv: environments wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
     :param model: a DTFM, or the path to a saved one
     :param bound: largest absolute noise
-    :param hidden_state: show the trunk's hidden state as well
+    :param hidden_state: show the Transformer's hidden state as well
     :raises ValueError: a policy whose actions do not depend on noise (DT, and one step of Euler, which ends at the mean
         action), environments that do not fit it, or an argument out of range
     """

@@ -30,7 +30,7 @@ class ResidualActionVecEnv(FrozenPolicyVecEnv):
     :param venv: environments wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
     :param model: a DTFM that carries out single actions without a critic's choice, or the path to a saved one
     :param bound: largest residual action, in units of actions in [-1, 1]
-    :param hidden_state: show the trunk's hidden state as well
+    :param hidden_state: show the Transformer's hidden state as well
     :raises ValueError: a policy that is no flow, carries out several actions of a plan or has its critic choose,
         environments that do not fit it, or an argument out of range
     """

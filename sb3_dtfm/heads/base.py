@@ -21,7 +21,7 @@ class ActionHead(nn.Module, ABC):
     :param options: of `options_class`, by name: users give them among `policy_kwargs`
     :raises ValueError: an option out of range, by name
 
-    :cvar algorithm: name of the algorithm that trunk and head make together, for example "DTFM"
+    :cvar algorithm: name of the algorithm that Transformer and head make together, for example "DTFM"
     :cvar discrete: the head for Discrete action spaces, with this head's options; None refuses them
     :cvar options_class: the head's options
     :ivar options: how the head was made and acts; :meth:`Options.changed` gives other ways of acting

@@ -42,7 +42,7 @@ from sb3_dtfm.windows import OBSERVATION, Windows, map_tensors
 
 class SequencePolicy(BasePolicy):
     """
-    A policy over the last `context_length` steps: the trunk's hidden state, and a head that makes an action of it.
+    A policy over the last `context_length` steps: the Transformer's hidden state, and a head that makes an action of it.
 
     `deterministic=True` starts from noise that belongs to the time step and the episode: rows of a table that is drawn once
     from `seed` and saved with the model, from a row on that the episode's first observation decides. Zero noise would be one
@@ -354,7 +354,7 @@ class SequencePolicy(BasePolicy):
         :param observation: as for :meth:`predict`
         :param state: what :meth:`decode` or :meth:`predict` returned; None for no past
         :param episode_start: (B,) bool, True where an environment was just reset
-        :return: the context with the newest step, and the trunk's hidden states (B, D)
+        :return: the context with the newest step, and the Transformer's hidden states (B, D)
         :raises ValueError: as :meth:`predict`
         """
         arrays, frames, _ = self._unpack(observation)

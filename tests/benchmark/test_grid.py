@@ -373,7 +373,7 @@ def test_a_file_of_other_rows_is_not_taken_for_the_run(grid, workplace, row):
         plan(parse_arguments([*grid[1:], "--label", "a-b"]))
 
 
-def test_algorithms_with_different_trunks_are_refused(grid, workplace):
+def test_algorithms_with_different_transformers_are_refused(grid, workplace):
     folder = workplace / "profile"
     folder.mkdir()
     for algo, width in (("dt", 16), ("dtfm", 32)):
