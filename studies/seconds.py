@@ -45,7 +45,7 @@ import matplotlib.pyplot as plt  # noqa: E402
 from filelock import FileLock, Timeout  # noqa: E402
 
 HERE = Path(__file__).parent
-DATA = ("hammer", "hopper", "hopper-ladder", "inverted-double-pendulum", "mountain-car", "relocate")
+DATA = ("hammer", "hopper", "hopper-mixed-quality", "inverted-double-pendulum", "mountain-car", "relocate")
 OURS = (*BASELINES, *ALGORITHMS)
 NAMES = {
     "bc": "BC",
