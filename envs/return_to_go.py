@@ -107,7 +107,7 @@ def flatten_observation_space(space: spaces.Space) -> spaces.Box:
 
 def return_to_go_space(observation_space: spaces.Space, images: Mapping[str, spaces.Box] | None = None) -> spaces.Dict:
     """
-    What a sequence policy observes, for an environment or for a dataset.
+    Observation space of a sequence policy, for an environment or for a dataset.
 
     :param observation_space: of the bare environment, or the flat one of a dataset's buffer
     :param images: of a dataset's buffer; those in `observation_space` by default
@@ -205,7 +205,7 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     @property
     def recorded_space(self) -> spaces.Space:
-        """What the environment itself observes, with sorted keys."""
+        """The environment's own observation space, with sorted keys."""
         return self.env.observation_space if self._cameras else self._vector_space
 
     def set_target_return(self, target_return: float) -> None:

@@ -1,4 +1,4 @@
-"""What the learn loop adds to Stable-Baselines3's own callbacks."""
+"""Callbacks that `learn` adds to Stable-Baselines3's own."""
 
 import time
 import warnings

@@ -501,7 +501,7 @@ class OfflineAlgorithm(SequenceModel):
         return {name: total / n_steps for name, total in sums.items()}
 
     def _sample_transitions(self, batch_size: int, generator: th.Generator) -> Transitions:
-        """What the critic learns from."""
+        """Data of the critic."""
         assert self.buffer is not None
         return self.buffer.sample_transitions(batch_size, self.policy.critic_horizon, self.policy.options.gamma, generator)
 

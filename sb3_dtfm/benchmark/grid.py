@@ -26,7 +26,7 @@ from sb3_dtfm.data.inspection import suggested_target_return
 from sb3_dtfm.zoo.arguments import UsageError, find_target_return, import_packages, with_target_return
 
 N_EVALUATIONS = 10  # of a run, unless --eval-freq says otherwise
-# What --algo takes.
+# Values of --algo.
 ALGOS = (*ALGORITHMS, *BASELINES)
 
 
@@ -82,7 +82,7 @@ class Job:
 
     @property
     def row(self) -> Row:
-        """What all of its rows say."""
+        """Content that all of its rows share."""
         renamed = {} if self.task.env_id == self.key.task else {"env_id": self.task.env_id}
         return {**self.key._asdict(), **renamed, "settings": self.settings, "data": self.data}
 
@@ -200,7 +200,7 @@ def _settings(task: Task, regime: float, options: argparse.Namespace) -> dict[st
 
 def _look_at(task: Task, settings: dict[str, Any]) -> tuple[dict[str, Any], float]:
     """
-    What the rows say of a task's data, and the target return that a run's share of them suggests.
+    Description of a task's data for the rows, and the target return that a run's share of them suggests.
 
     :raises DatasetError: they cannot be read, or are of another task
     :raises UsageError: the environment cannot be made

@@ -101,12 +101,12 @@ COLUMNS = {
     "hardware": Column("hardware", _json, "run"),
     "versions": Column("versions", _versions, "run"),
 }
-# What is said of a run once, with its final evaluation.
+# Columns that a run fills once, with its final evaluation.
 OF_A_RUN = ("action_ms", "flow_solver", "flow_steps", "commit", "env_id", "data", "settings", "hardware", "versions")
 
 
 def summarize(row: Row) -> Result:
-    """What an evaluation came to."""
+    """Result of an evaluation."""
     returns, lengths, successes = (row[key] for key in ("returns", "lengths", "successes"))
     counts = {
         "n_episodes": len(returns),

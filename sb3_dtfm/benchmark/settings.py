@@ -65,7 +65,7 @@ class Task(NamedTuple):
 
 
 def profile_name(profile: str) -> str:
-    """What rows call a profile: its own name, or that of its file or folder."""
+    """Name of a profile in rows: its own, or that of its file or folder."""
     return profile if profile in PROFILES else Path(profile).stem
 
 
@@ -157,7 +157,7 @@ def task_settings(
 
 def cloning_settings(algo: str, settings: Mapping[str, Any], n_timesteps: int | None) -> dict[str, Any]:
     """
-    What a run of behaviour cloning is to read.
+    Settings of a run of behaviour cloning.
 
     :param algo: one of `BASELINES`
     :param settings: of DT or DTFM, whose data and environment are its own, too
@@ -199,7 +199,7 @@ def _known(settings: dict[str, Any], algo: str, parameters: Callable[[str], set[
     """
     The settings without those that only other algorithms know.
 
-    :raises UsageError: nobody knows one of them
+    :raises UsageError: one of them is unknown
     """
     unknown = set(settings).difference(*map(parameters, ALGORITHMS))
     if unknown:
@@ -208,10 +208,10 @@ def _known(settings: dict[str, Any], algo: str, parameters: Callable[[str], set[
 
 
 def _constructor_parameters(algo: str) -> set[str]:
-    """What may stand in a YAML file: arguments of the algorithm, and RL-Zoo's own."""
+    """Keys of a YAML file: arguments of the algorithm, and RL-Zoo's own."""
     return ZOO_KEYS | set(inspect.signature(ALGORITHMS[algo]).parameters)
 
 
 def _policy_parameters(algo: str) -> set[str]:
-    """What may stand in its `policy_kwargs`."""
+    """Keys of its `policy_kwargs`."""
     return policy_of(algo).parameter_names()

@@ -11,7 +11,7 @@ from gymnasium.error import Error as GymnasiumError
 
 from sb3_dtfm import __version__
 
-# What a user's mistake is raised as: TypeError for an argument that somebody's constructor does not know.
+# Exceptions of a user's mistake: TypeError for an argument that a constructor does not know.
 EXPECTED_ERRORS = (ValueError, TypeError, AssertionError, OSError, ImportError, GymnasiumError)
 
 # Each is `main(argv)` in a module of this package that has its name, and is imported when it is asked for.

@@ -1,4 +1,4 @@
-"""What is in a buffer, and what a user should know of it before training."""
+"""Content of a buffer, and possible faults of it before training."""
 
 from typing import NamedTuple
 
@@ -39,7 +39,7 @@ class Range(NamedTuple):
 
 class Inspection(NamedTuple):
     """
-    What was found.
+    Findings.
 
     :param observations: of O dimensions
     :param actions: of A dimensions, in the environment's range; of a Discrete space's n actions, whose mean is a share

@@ -40,12 +40,12 @@ class NoiseSpace(spaces.Box):
 
 class NoiseActionVecEnv(FrozenPolicyVecEnv):
     """
-    Acts with a frozen DTFM from noise that somebody else chooses: `SAC("MlpPolicy", NoiseActionVecEnv(venv, model))`.
+    Acts with a frozen DTFM from noise that an online algorithm chooses: `SAC("MlpPolicy", NoiseActionVecEnv(venv, model))`.
 
     One step is one decision of the frozen policy: with `chunk_size` it carries out `n_action_steps` actions, and rewards
     are added up, without a discount, so that the return of an episode stays what it is. A discount factor counts decisions.
 
-    What is observed, and what happens to the model, see :class:`~sb3_dtfm.finetuning.frozen_env.FrozenPolicyVecEnv`.
+    For observations, and for the model, see :class:`~sb3_dtfm.finetuning.frozen_env.FrozenPolicyVecEnv`.
 
     :param venv: environments wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
     :param model: a DTFM, or the path to a saved one

@@ -158,7 +158,7 @@ def make_online_actor(
 
 def check_noise_actions(policy: SequencePolicy) -> int:
     """
-    :return: N, numbers of the noise that somebody else may choose
+    :return: N, numbers of the noise that an online algorithm chooses
     :raises ValueError: there is no flow
     """
     head = policy.network.head

@@ -20,10 +20,10 @@ RESIDUAL_BOUND = 0.5
 
 class ResidualActionVecEnv(FrozenPolicyVecEnv):
     """
-    Acts with a frozen DTFM, and adds what somebody else chooses to its actions: residual reinforcement learning (Johannink
+    Acts with a frozen DTFM, and adds an online algorithm's choice to its actions: residual reinforcement learning (Johannink
     et al., 2019; Silver et al., 2018). A choice of zeros is what the DTFM does with `deterministic=True`.
 
-    What is observed, see :class:`~sb3_dtfm.finetuning.frozen_env.FrozenPolicyVecEnv`, and behind it the DTFM's own action,
+    For observations, see :class:`~sb3_dtfm.finetuning.frozen_env.FrozenPolicyVecEnv`, and behind it the DTFM's own action,
     between -1 and 1. Rewards are divided by `reward_unit`, what ten steps bring of the episode with the largest absolute
     return of the model's training data, so that value functions need no other normalisation.
 

@@ -161,7 +161,7 @@ class SequencePolicy(BasePolicy):
 
     @classmethod
     def parameter_names(cls) -> set[str]:
-        """What `policy_kwargs` may hold: options of the policy and of its head."""
+        """Keys of `policy_kwargs`: options of the policy and of its head."""
         return set(PolicyOptions.defaults()) | set(cls.head_class.options_class.defaults())
 
     @classmethod
@@ -284,7 +284,7 @@ class SequencePolicy(BasePolicy):
         enough: a row starts anew where its time step is not the last one plus one, and is asked again where both time step
         and observation are the last ones. :meth:`reset` forgets it.
 
-        Actions are finite and inside the action space. What cannot be acted on is an error before anything has changed: the
+        Actions are finite and inside the action space. Invalid input is an error before anything has changed: the
         caller mends the row that it names, or begins it anew, and asks again; the other rows go on as if nothing had been.
 
         :param observation: Dict of `observation` (O,), `return_to_go` (1,), `timestep` (1,), or with a leading axis B, and
@@ -395,7 +395,7 @@ class SequencePolicy(BasePolicy):
 
     def apply_actions(self, context: Context, chunks: np.ndarray) -> tuple[np.ndarray, Context]:
         """
-        What comes of actions that somebody else has chosen.
+        Carry out actions that an online algorithm has chosen.
 
         :param context: what :meth:`encode` returned
         :param chunks: (B, h, A) in [-1, 1], for at least the `n_action_steps` that are carried out

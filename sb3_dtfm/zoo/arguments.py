@@ -1,4 +1,4 @@
-"""What `sb3-dtfm train` and `enjoy` add to RL-Zoo's own arguments, written in terms of those."""
+"""Arguments of `sb3-dtfm train` and `enjoy` beside RL-Zoo's own, written in terms of those."""
 
 import argparse
 from collections.abc import Callable, Sequence
@@ -134,7 +134,7 @@ class StoreLiterals(argparse.Action):
 
 class Restored(NamedTuple):
     """
-    What the user names beside `--resume RUN`, where all other arguments come from the run's folder.
+    Arguments beside `--resume RUN`, where all other arguments come from the run's folder.
 
     :param run: its folder
     :param packages: of `--gym-packages`
@@ -218,7 +218,7 @@ def train_parser() -> argparse.ArgumentParser:
 
 def restored_arguments(run: Path, others: Sequence[str]) -> Restored | None:
     """
-    What a user names beside `--resume`, whose packages are imported; None where there are other arguments.
+    Arguments beside `--resume`, whose packages are imported; None where there are other arguments.
 
     :param run: its folder
     :param others: the user's arguments beside `--resume`

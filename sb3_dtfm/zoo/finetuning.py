@@ -272,7 +272,7 @@ class FinetunedManager(FinetuningManager):
 
 class OnlineManager(FinetuningManager):
     """
-    The DTFM itself goes on learning, as an :class:`~sb3_dtfm.finetuning.OnlineDTFM`. What comes of it is a run of "dtfm".
+    The DTFM itself goes on learning, as an :class:`~sb3_dtfm.finetuning.OnlineDTFM`. The result is a run of "dtfm".
 
     The dataset is that of the DTFM's run. Own episodes are kept beside the model; who goes on from there takes them up.
     """

@@ -1,4 +1,4 @@
-"""What a repository of Hugging Face's hub holds of a trained model, and what of it is believed by who downloads it."""
+"""Repositories of Hugging Face's hub: their content, and the part of it that a download trusts."""
 
 import argparse
 import json
@@ -28,7 +28,7 @@ class HubError(OSError):
 
 class Settings(NamedTuple):
     """
-    What acting needs besides the model.
+    Everything that acting needs besides the model.
 
     :param algo: a key of `ALGORITHMS`
     :param env: Gymnasium id
@@ -43,7 +43,7 @@ class Settings(NamedTuple):
 
     @property
     def model_name(self) -> ModelName:
-        """Of the model and, if nobody says otherwise, of its repository."""
+        """Of the model and, by default, of its repository."""
         return ModelName(self.algo, EnvironmentName(self.env))
 
     def write(self, folder: Path) -> None:
@@ -99,7 +99,7 @@ class Settings(NamedTuple):
 
 class Result(NamedTuple):
     """
-    What an evaluation came to.
+    Result of an evaluation.
 
     :param mean_reward: over the episodes
     :param std_reward: over the episodes

@@ -14,11 +14,11 @@ from sb3_dtfm.envs import register_gymnasium_robotics
 from sb3_dtfm.finetuning import FINETUNED, FinetunedDTFM
 from sb3_dtfm.policies import SequencePolicy
 
-# What `finetune --algo` calls a DTFM that goes on by itself; its run is one of this algorithm, as any other.
+# Name of filtered imitation in `finetune --algo`; its run is one of this algorithm, as any other.
 ONLINE = "dtfm"
-# Where settings of the online algorithms are.
+# Folder of the online algorithms' settings.
 FINETUNING_CONFIGS = "sb3_dtfm.zoo_configs.finetune"
-# What `--conf-file` accepts besides files and Python packages; None is no `--conf-file` at all.
+# Values of `--conf-file` besides files and Python packages; None is no `--conf-file` at all.
 PACKAGED_CONFIGS = {None: "sb3_dtfm.zoo_configs", "paper": "sb3_dtfm.zoo_configs.paper"}
 
 
@@ -125,7 +125,7 @@ def sample_params(
 
 
 def _sample_transformer(trial: optuna.Trial) -> dict[str, Any]:
-    """What both algorithms share: optimiser, context and Transformer."""
+    """Shared by both algorithms: optimiser, context and Transformer."""
     return {
         "learning_rate": trial.suggest_float("learning_rate", 3e-5, 3e-3, log=True),
         "batch_size_pow": trial.suggest_int("batch_size_pow", 5, 8),

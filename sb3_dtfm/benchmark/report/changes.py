@@ -1,4 +1,4 @@
-"""What `--label`s changed: the settings that differ from the profile's own, and what became of the results."""
+"""Changes of `--label`s: the settings that differ from the profile's own, and what became of the results."""
 
 from collections.abc import Sequence
 from typing import Any

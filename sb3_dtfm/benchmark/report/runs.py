@@ -78,14 +78,14 @@ class Run(NamedTuple):
 
     @property
     def zero(self) -> float:
-        """What scores 0: no success, or the mean return of random actions; a return of 0 where that is not known."""
+        """Reference of score 0: no success, or the mean return of random actions; a return of 0 where that is not known."""
         return float(self.final["data"]["random_return"]) if self.knows_random else 0.0
 
     @property
     def scale(self) -> float | None:
         """
-        What scores 1: the successes of the best tenth of the recorded episodes, in percent, or 100 where the data do not
-        tell; the mean return of the best tenth, or of all where that of random actions is not known.
+        Reference of score 1: the successes of the best tenth of the recorded episodes, in percent, or 100 if unknown;
+        else the mean return of the best tenth, or of all where that of random actions is not known.
 
         :return: None where that is not known, or not above what scores 0
         """
@@ -221,7 +221,7 @@ class Group(NamedTuple):
 
 class Study(NamedTuple):
     """
-    What one folder or table of results holds.
+    Content of one folder or table of results.
 
     :param name: of the folder or table, "" for what was named itself
     :param groups: its runs by profile and label
@@ -247,7 +247,7 @@ def read_studies(paths: Iterable[str | os.PathLike[str]], tasks: Sequence[str] =
 
 
 def full_name(algo: str) -> str:
-    """What figures and tables call an algorithm where there is room."""
+    """Long name of an algorithm in figures and tables."""
     return {"bc-best": "BC of the best tenth"}.get(algo, algo.upper())
 
 

@@ -119,7 +119,7 @@ def _reached(runs: Sequence[Run]) -> str:
 
 
 def _recorded(run: Run) -> str:
-    """What the recorded episodes reached, and the best tenth of them."""
+    """Mean of the recorded episodes, and of the best tenth of them."""
     data = run.final["data"]
     if run.counts_success:
         shares = [data.get("success_rate"), data.get("best_success")]
