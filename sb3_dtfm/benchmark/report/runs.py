@@ -85,7 +85,7 @@ class Run(NamedTuple):
     def scale(self) -> float | None:
         """
         Reference of score 1: the successes of the best tenth of the recorded episodes, in percent, or 100 if unknown;
-        else the mean return of the best tenth, or of all where that of random actions is not known.
+        without successes the mean return of the best tenth, or of all where that of random actions is not known.
 
         :return: None where that is not known, or not above what scores 0
         """
