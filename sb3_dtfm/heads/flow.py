@@ -95,9 +95,8 @@ class FlowHead(ActionHead):
     By the flow's loss alone the Transformer learns the mean more slowly.
 
     With `one_step_policy` a second network learns where `flow_steps` of Euler end, 16 at most, so that an action can take
-    one evaluation instead of one per solver step. It learns from the field and passes no gradient back: Transformer and
-    field stay as without it. Where the field predicts actions, this network adds to the same W h + b, and starts at zero
-    too; else it adds to the noise.
+    one evaluation instead of one per solver step. It passes no gradient back. Where the field predicts actions, it adds
+    to the same W h + b, and starts at zero, too; else it adds to the noise.
 
     :param embed_dim: D
     :param action_dim: A
@@ -161,7 +160,7 @@ class FlowHead(ActionHead):
         """
         Conditional flow matching (Lipman et al., 2023): squared error on the path from noise to action.
 
-        Of the velocity, or of the action, which weighs the velocity's by (1 - tau)^2.
+        The error is the velocity's, or the action's, which weighs the velocity's by (1 - tau)^2.
 
         :param hidden: (B, K, D)
         :param actions: (B, K, A) in [-1, 1]
