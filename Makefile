@@ -8,7 +8,7 @@ STAMP := $(VENV)/installed
 OTHERS := .venv-baselines
 ROBOMIMIC := .venv-robomimic
 OGBENCH := .venv-ogbench
-# What looks at dependencies, makes the site and looks at what is published, apart from them.
+# Tools that check dependencies, make the site and check releases, apart from them.
 TOOLS := .venv-tools
 # Tests of each part that meets other packages.
 SMOKE := tests/cli/test_command_line.py tests/data/test_minari.py tests/envs/robosuite/test_env.py tests/files/test_model.py \
@@ -88,7 +88,7 @@ $(OTHERS)/installed: constraints.txt
 baselines: install $(OTHERS)/installed $(ROBOMIMIC)/installed
 	PYTHONPATH=studies $(BIN)/python -m baselines $(ARGUMENTS)
 
-# What of robomimic learns from vectors needs no more than this; with its own requirements pip would take another torch.
+# Learning from vectors in robomimic needs no more than this; with its own requirements pip would take another torch.
 $(ROBOMIMIC)/installed: constraints.txt
 	rm -rf $(ROBOMIMIC)
 	$(BIN)/python -m venv $(ROBOMIMIC)
@@ -134,7 +134,7 @@ newest: $(TOOLS)/installed
 audit: install $(TOOLS)/installed
 	$(TOOLS)/bin/pip-audit --strict --disable-pip --no-deps -r constraints.txt
 
-# Of the pinned packages alone: CUDA's, which PyTorch brings on some platforms, are left to the page's text.
+# The pinned packages alone: CUDA's, which PyTorch brings on some platforms, are left to the page's text.
 licences: install $(TOOLS)/installed
 	sed -i '/^| Name/,$$d' docs/licences.md
 	$(TOOLS)/bin/pip-licenses --python $(BIN)/python --from=mixed --with-system --format=markdown \
@@ -174,7 +174,7 @@ lint: install
 type: install linked
 	cd build/linked && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache
 
-# Who reads folders gets the package put together by links, as an installation would have it.
+# Tools that read folders get the package put together by links, as an installation would have it.
 linked:
 	@rm -rf build/linked && mkdir -p build/linked/sb3_dtfm
 	@ln -s $(CURDIR)/sb3_dtfm/* build/linked/sb3_dtfm/

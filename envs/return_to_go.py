@@ -107,7 +107,7 @@ def flatten_observation_space(space: spaces.Space) -> spaces.Box:
 
 def return_to_go_space(observation_space: spaces.Space, images: Mapping[str, spaces.Box] | None = None) -> spaces.Dict:
     """
-    What a sequence policy observes, for an environment or for a dataset.
+    Observation space of a sequence policy, for an environment or for a dataset.
 
     :param observation_space: of the bare environment, or the flat one of a dataset's buffer
     :param images: of a dataset's buffer; those in `observation_space` by default
@@ -165,9 +165,9 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     (goal-conditioned tasks, for example) is flattened to one vector, see :func:`flatten_observation_space`; its images stay
     as they are, each by its key.
 
-    An episode that is ahead of its target keeps the target's pace: in an environment with a time limit of T steps it is
-    shown at least target (1 - t / T). Otherwise a policy that leaves out its recordings' noise, and so returns more, is
-    asked for less and less, and acts as a worse agent did.
+    In an environment with a time limit of T steps the return-to-go is at least target (1 - t / T). Without this bound an
+    episode that is ahead of its target gets ever lower returns-to-go: a policy that leaves out its recordings' noise, and
+    so returns more, then acts as a worse agent did.
 
     `step` also takes several actions, (N, A): they are carried out one after the other until the episode ends, rewards are
     added up, and `info` has the observations between them, stacked by key, under `BETWEEN`. So whoever decides once for
@@ -180,16 +180,16 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     `EvalCallback` and logs know.
 
     :param env: the environment to wrap
-    :param target_return: return to ask for in each episode, environment reward units; None takes the model's
-    :param keep_pace: keep the target's pace; False shows the target less the rewards, as Decision Transformer does
+    :param target_return: of each episode, environment reward units; None takes the model's
+    :param bound_return_to_go: keep that bound; False shows the target less the rewards, as Decision Transformer does
     :raises ValueError: `target_return` is not a finite number, or the observation space cannot be flattened
     """
 
-    def __init__(self, env: gym.Env, target_return: float | None = None, keep_pace: bool = True) -> None:
-        RecordConstructorArgs.__init__(self, target_return=target_return, keep_pace=keep_pace)
+    def __init__(self, env: gym.Env, target_return: float | None = None, bound_return_to_go: bool = True) -> None:
+        RecordConstructorArgs.__init__(self, target_return=target_return, bound_return_to_go=bound_return_to_go)
         super().__init__(env)
         warn_of_reward(env)
-        self._time_limit = env.spec.max_episode_steps if keep_pace and env.spec is not None else None
+        self._time_limit = env.spec.max_episode_steps if bound_return_to_go and env.spec is not None else None
         self.target_return = None if target_return is None else check_target_return(target_return)
         self.observation_space = return_to_go_space(env.observation_space)
         self._monitor: Any = unwrap_wrapper(env, Monitor)
@@ -205,7 +205,7 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     @property
     def recorded_space(self) -> spaces.Space:
-        """What the environment itself observes, with sorted keys."""
+        """The environment's own observation space, with sorted keys."""
         return self.env.observation_space if self._cameras else self._vector_space
 
     def set_target_return(self, target_return: float) -> None:
@@ -329,11 +329,11 @@ def recorded_space(env: VecEnv) -> spaces.Space:
 
 def share_target_return(env: VecEnv, target_return: float | None) -> float | None:
     """
-    Have each :class:`ReturnToGoWrapper` without a target ask for this return.
+    Set the target return of each :class:`ReturnToGoWrapper` that has none.
 
     :param env: wrapped inside
     :param target_return: environment reward units; None takes the first target that there is
-    :return: what it is, None where nobody knows
+    :return: the target return, None where none is known
     """
     targets = env.get_attr("target_return")
     if target_return is None:

@@ -1,4 +1,4 @@
-"""What environments say of an episode's success."""
+"""Success of an episode, as environments report it."""
 
 from typing import Any
 

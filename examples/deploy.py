@@ -62,7 +62,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Play episodes with an exported policy.")
     parser.add_argument("policy", help="what `sb3-dtfm export` wrote")
     parser.add_argument("--env", help="Gymnasium id; what the file says by default")
-    parser.add_argument("--target-return", type=float, help="to ask for; what the file says by default")
+    parser.add_argument("--target-return", type=float, help="in reward units; by default the file's")
     parser.add_argument("--episodes", type=int, default=10, help="10 by default")
     parser.add_argument("--seed", type=int, default=0, help="of the first initial state")
     options = parser.parse_args()
@@ -83,8 +83,8 @@ def main() -> None:
         return_to_go, timestep, done, milliseconds = target, 0, False, []
         while not done:
             start = time.perf_counter()
-            pace = target * (1 - timestep / time_limit) if time_limit else -np.inf  # of an episode ahead of its target
-            action = policy.act(observation, max(return_to_go, pace), timestep)
+            least = target * (1 - timestep / time_limit) if time_limit else -np.inf  # for an episode ahead of its target
+            action = policy.act(observation, max(return_to_go, least), timestep)
             milliseconds.append((time.perf_counter() - start) * 1e3)
             observation, reward, terminated, truncated, info = env.step(action)
             return_to_go, timestep, done = return_to_go - float(reward), timestep + 1, terminated or truncated

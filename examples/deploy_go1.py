@@ -37,7 +37,7 @@ EPISODE_STEPS = 1000  # of training
 
 class Measurement(NamedTuple):
     """
-    What the robot measures.
+    Measurements of the robot.
 
     :param orientation: quaternion of the trunk, (4,) w x y z
     :param gyro: (3,) rad/s
@@ -60,7 +60,7 @@ class Measurement(NamedTuple):
 
 
 class Robot(Protocol):
-    """What hardware code implements."""
+    """Interface that hardware code implements."""
 
     def read(self) -> Measurement:
         """The newest measurement."""

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from gymnasium import spaces
 
-# What actions can be learned from.
+# Action spaces that can be learned.
 ActionSpace: TypeAlias = spaces.Box | spaces.Discrete
 
 

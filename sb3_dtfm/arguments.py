@@ -142,7 +142,7 @@ SelfOptions = TypeVar("SelfOptions", bound=Options)
 
 def with_nearest(names: Iterable[str], known: Iterable[str]) -> str:
     """
-    Names that nobody knows, for a message, each with the known one that may be meant.
+    Unknown names, for a message, each with the known one that may be meant.
 
     :param names: as the user spelled them
     :param known: all that are accepted

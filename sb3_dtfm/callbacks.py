@@ -1,4 +1,4 @@
-"""What the learn loop adds to Stable-Baselines3's own callbacks."""
+"""Callbacks that `learn` adds to Stable-Baselines3's own."""
 
 import time
 import warnings
@@ -198,7 +198,7 @@ class EvaluateAtStartAndEnd(BaseCallback):
 
 class NormalizedScoreCallback(BaseCallback):
     """
-    Log `eval/normalized_score` after each evaluation, whatever asked for it. Put it behind the callbacks that evaluate.
+    Log `eval/normalized_score` after each evaluation, whatever started it. Put it behind the callbacks that evaluate.
 
     :param score_reference: the returns that count as 0 and 1
     :param eval_callbacks: the evaluations to follow

@@ -25,7 +25,7 @@ ONE_THREADS_MACS = 3e9
 
 def learning_rate_factor(schedule: str, step: int, progress: float, warmup_steps: int = 0) -> float:
     """
-    What the learning rate is multiplied by.
+    Factor of the learning rate.
 
     :param schedule: "constant", or "linear" or "cosine" down to zero at the end
     :param step: gradient steps done
@@ -49,7 +49,7 @@ def multiplies_bfloat16(device: th.device) -> bool:
 
 def choose_precision(network: nn.Module, n_rows: int, device: th.device, n_processes: int = 1) -> tuple[str, str]:
     """
-    What the precision "auto" is, and why: bfloat16 where the hardware multiplies in it, on a CPU only if that is faster than
+    Precision of "auto", and why: bfloat16 where the hardware multiplies in it, on a CPU only if that is faster than
     float32 for the network's own products, which are timed once for each process.
 
     :param network: its linear layers and convolutions count, these as products of the weights that an output needs
@@ -203,13 +203,13 @@ class RunningMeans:
         return means
 
 
-# What each number of a run's random stream is for.
+# Purpose of each number of a run's random stream.
 BATCHES, NOISE, DROPOUT, TRANSITIONS, OWN_BATCHES = range(5)
 
 
 def step_seed(seed: int, n_updates: int, *purpose: int) -> int:
     """
-    What a generator is seeded with for one gradient step.
+    Seed of a generator for one gradient step.
 
     Each step has a seed of its own, so that a run that was interrupted goes on as if it had not been.
 

@@ -34,7 +34,7 @@ def make_dataset() -> d3rlpy.dataset.ReplayBuffer:
 
 
 def make_algorithm(width: int, n_layers: int) -> Any:
-    """The trunk's size and the dropout of the other worker; activation and optimiser are d3rlpy's own."""
+    """The Transformer's size and the dropout of the other worker; activation and optimiser are d3rlpy's own."""
     return d3rlpy.algos.DecisionTransformerConfig(
         batch_size=BATCH_SIZE,
         context_size=CONTEXT_LENGTH,

@@ -9,7 +9,7 @@ What fine-tuning brought: runs of `sb3-dtfm finetune` as rows, and their curves.
 
 `measure` plays 100 final episodes, as `sb3-dtfm benchmark` does, with the model before (rows of the label "before"), with
 the last one after, and with the best of its evaluations (rows of the label with "-best"), and takes the curve from the run's
-evaluations.npz. Its steps are the environments', its seconds those until then, evaluations included. `--like` is the cell of
+evaluations.npz. Its steps are the environments', its seconds those until then, evaluations included. `--like` is the run of
 the model before: its rows tell task, data and seed. Final episodes are played in the environments of the run's evaluations.
 `rollouts` shows models that learned from more or fewer rollouts, each label so many, by how many steps of the environment
 these took, each task beside the others.
@@ -30,7 +30,7 @@ from sb3_dtfm.benchmark import provenance
 from sb3_dtfm.benchmark.evaluation import FINAL_STATES, evaluate, make_seeded_envs
 from sb3_dtfm.benchmark.report.runs import Group, Run, read_studies, row_value
 from sb3_dtfm.benchmark.report.statistics import student_t
-from sb3_dtfm.benchmark.rows import Cell, Row, read_rows, write_row
+from sb3_dtfm.benchmark.rows import Row, RunKey, read_rows, write_row
 from sb3_dtfm.files import read_run
 from sb3_dtfm.finetuning import FINETUNED
 from sb3_dtfm.recording.loading import load_agent
@@ -69,7 +69,7 @@ def measure(run: Path, before: Path, like: Row, label: str, output: Path) -> Non
     ):
         row = {**like, "settings": settings, "label": name, "commit": provenance.commit(), "versions": provenance.versions()}
         rows = [*earlier, {"step": steps, "final": True, **final_episodes(path, envs)}]
-        file = output / f"{Cell.of(row).file_name}.jsonl"
+        file = output / f"{RunKey.of(row).file_name}.jsonl"
         file.unlink(missing_ok=True)
         for each in rows:
             seconds = float(np.interp(each["step"], times[:, 1], times[:, 0]))
@@ -177,7 +177,7 @@ def by_rollout_steps(folder: Path, task: str) -> tuple[np.ndarray, np.ndarray]:
     """
     groups = [runs_of(group, task) for study in read_studies([folder]) for group in study.groups]
     found = sorted(filter(None, groups), key=mean_steps)
-    if len({tuple(run.cell.seed for run in runs) for runs in found}) != 1:
+    if len({tuple(run.key.seed for run in runs) for runs in found}) != 1:
         raise SystemExit(f"{folder}: rows of {task} with the same seeds for each label are needed.")
     steps = np.array([mean_steps(runs) for runs in found])
     return steps - steps[0], np.array([[row_value(run.final) for run in runs] for runs in found]).T

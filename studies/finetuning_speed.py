@@ -32,7 +32,7 @@ from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
 from sb3_dtfm.zoo.finetuning import keep_one_action
 from sb3_dtfm.zoo.registration import finetuning_config, packaged_config
 
-# Beside those of the trunk and the head, what the settings of a task say about a model.
+# Beside those of the Transformer and the head, what the settings of a task say about a model.
 OF_THE_MODEL = ("context_length", "ema_decay", "policy_kwargs")
 VEC_ENVS: dict[str, type[VecEnv]] = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}
 WAYS = {"sac": (SAC, NoiseActionVecEnv), "ppo": (PPO, ResidualActionVecEnv)}
@@ -173,7 +173,7 @@ def measure_wrapped(envs: FrozenPolicyVecEnv, seconds: float) -> dict[str, Any]:
     timed = Timed(
         {
             "environment": (envs.venv, "step_wait"),
-            "trunk and context": (envs.policy, "encode"),
+            "Transformer and context": (envs.policy, "encode"),
             "head": (envs.policy, "decode"),
             "steps of a chunk": (envs, "_pass"),
         }

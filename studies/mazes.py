@@ -32,7 +32,7 @@ class Path2D(NamedTuple):
 
 def model_paths(model: BaseAlgorithm, env_kwargs: dict[str, Any], n_episodes: int) -> list[Path2D]:
     """
-    The ways of a model that acts deterministically, from the initial states of final evaluations, asked for a return of 1.
+    The ways of a model that acts deterministically, from the initial states of final evaluations, with a target return of 1.
 
     :param env_kwargs: of the environment
     """
@@ -46,7 +46,7 @@ def model_paths(model: BaseAlgorithm, env_kwargs: dict[str, Any], n_episodes: in
 
 
 def benchmark_arguments(dataset_id: str, env_kwargs: dict[str, Any], *others: str) -> str:
-    """What `sb3-dtfm benchmark` is told of a maze and its demonstrations, asked for a return of 1."""
+    """Arguments of `sb3-dtfm benchmark` for a maze and its demonstrations, with a target return of 1."""
     words = [f"{key}:{value!r}".replace(" ", "") for key, value in env_kwargs.items()]
     data = ["--dataset", f"{ENV_ID}={dataset_id}", "--target-return", "1", "--fractions", "1.0"]
     return " ".join([*data, *others, "--env-kwargs", *words])

@@ -3,7 +3,7 @@ How many gradient steps a second one process makes with a thread and with two, a
 
     python studies/processes.py --dataset local/halfcheetah/expert-v0
 
-By `sb3-dtfm train`, in turn, all with 64 windows a step: a small network of width 128, and the paper's trunk and head.
+By `sb3-dtfm train`, in turn, all with 64 windows a step: a small network of width 128, and the paper's Transformer and head.
 Prints a row for each size: the rates of all rounds.
 """
 

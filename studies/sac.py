@@ -4,7 +4,7 @@ What fine-tuning stands beside: SAC from scratch, and SAC with the recorded epis
     OMP_NUM_THREADS=1 python studies/sac.py --like mine/robosuite-Can-v0_0.05_dtfm_seed0_small.jsonl -n 120000 \\
         --eval-freq 30000 --output mine [--with-data]
 
-`--like` is a cell of the model that is fine-tuned: its rows tell task, data and seed. Stable-Baselines3's SAC at its own
+`--like` is a run of the model that is fine-tuned: its rows tell task, data and seed. Stable-Baselines3's SAC at its own
 settings, in ten environments, with a gradient step for each step of one. Evaluations are those of `sb3-dtfm benchmark`, and
 the rows' steps the environments'; both numbers of steps have to be multiples of ten. A run that is killed leaves no rows.
 """
@@ -19,7 +19,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_dtfm.benchmark.evaluation import EvaluationCallback
-from sb3_dtfm.benchmark.rows import Cell, read_rows
+from sb3_dtfm.benchmark.rows import RunKey, read_rows
 from sb3_dtfm.data import TrajectoryBuffer, load_dataset
 from sb3_dtfm.files import replacing
 
@@ -82,7 +82,7 @@ def main() -> None:
         "settings": {"n_envs": N_ENVS, **SETTINGS, **of_the_task, **(of_the_data if options.with_data else {})},
     }
     options.output.mkdir(parents=True, exist_ok=True)
-    with replacing(options.output / f"{Cell.of(row).file_name}.jsonl") as rows:
+    with replacing(options.output / f"{RunKey.of(row).file_name}.jsonl") as rows:
         evaluation = (options.eval_freq, options.eval_episodes, N_FINAL_EPISODES, N_ENVS)
         agent.learn(options.n_timesteps, EvaluationCallback(str(rows), row, *evaluation))
 

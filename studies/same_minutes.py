@@ -5,7 +5,7 @@ What a study's runs had reached when those of another one, which need fewer minu
 
 A line for each task and algorithm: the means over the last three evaluations that were made within these minutes of
 training, seed by seed. The longer runs are cut short, so their learning rate had not come down yet. Other jobs can only make
-a run slower: the steps take as long as in a cell's quickest run.
+a run slower: the steps take as long as in the quickest run of a task and algorithm.
 """
 
 import argparse
@@ -21,7 +21,7 @@ N_LAST = 3
 def runs_of(folder: Path, label: str) -> dict[tuple, list[Run]]:
     """By task, share of the data and algorithm."""
     groups = [group for study in read_studies([folder]) for group in study.groups if group.label == label]
-    return {cell: runs for group in groups for cell, runs in group.runs.items()}
+    return {key: runs for group in groups for key, runs in group.runs.items()}
 
 
 def minutes_a_step(runs: list[Run]) -> float:
@@ -43,12 +43,12 @@ def main() -> None:
     arguments = parser.parse_args()
     quick, slow = (runs_of(*which) for which in zip(arguments.folders, arguments.labels, strict=True))
     print("| task | data | algorithm | minutes | whole, seed by seed | cut short |\n| --- | --- | --- | --- | --- | --- |")
-    for cell in sorted(quick.keys() & slow.keys()):
-        task, share, algo = cell
-        minutes = minutes_a_step(quick[cell]) * quick[cell][0].final["step"]
-        n_steps = minutes / minutes_a_step(slow[cell])
+    for key in sorted(quick.keys() & slow.keys()):
+        task, share, algo = key
+        minutes = minutes_a_step(quick[key]) * quick[key][0].final["step"]
+        n_steps = minutes / minutes_a_step(slow[key])
         whole, cut = (
-            "; ".join(reached(run, limit) for run in runs) for runs, limit in ((quick[cell], np.inf), (slow[cell], n_steps))
+            "; ".join(reached(run, limit) for run in runs) for runs, limit in ((quick[key], np.inf), (slow[key], n_steps))
         )
         print(f"| {task} | {share:.0%} | {algo.upper()} | {minutes:.1f} | {whole} | {cut} |")
 

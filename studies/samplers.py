@@ -52,14 +52,14 @@ def evaluate_ways(options: argparse.Namespace) -> None:
 
 def report(files: list[str]) -> None:
     """Success where the task has it, else returns; episodes of all models of a task together."""
-    cells: dict[tuple[str, str], dict[str, list[float]]] = defaultdict(lambda: {"returns": [], "successes": []})
+    grouped: dict[tuple[str, str], dict[str, list[float]]] = defaultdict(lambda: {"returns": [], "successes": []})
     for line in (line for file in files for line in Path(file).read_text().splitlines()):
         row = json.loads(line)
-        for key, values in cells[row["env"], row["way"]].items():
+        for key, values in grouped[row["env"], row["way"]].items():
             values += row[key] or []
     print("| task | acting | success or mean return | 95 % interval, or standard deviation | episodes |")
     print("| --- | --- | --- | --- | --- |")
-    for (env, way), values in cells.items():
+    for (env, way), values in grouped.items():
         returns, successes = values["returns"], values["successes"]
         if successes:
             _, low, high = wilson(int(sum(successes)), len(successes))

@@ -7,14 +7,14 @@ Seconds from the command to 95 % of what the best tenth of the recorded episodes
 
 Data sets are those of studies/suite.yml. `wall_s` of a row are processor seconds of the learning process since it was
 started: imports, reading the data, and all gradient steps; neither environments nor evaluations. d3rlpy's algorithms need
-`make .venv-baselines/installed`. A cell that is finished is not run again, and two calls share the cells between them.
+`make .venv-baselines/installed`. A run that is finished is not started again, and two calls share the runs between them.
 """
 
 import time
 
 import numpy as np
 import torch as th
-from baselines.cells import PROFILE, WORKERS, Baseline, read_entries
+from baselines.entries import PROFILE, WORKERS, Baseline, read_entries
 from baselines.process import BaselineProcess
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -45,7 +45,7 @@ import matplotlib.pyplot as plt  # noqa: E402
 from filelock import FileLock, Timeout  # noqa: E402
 
 HERE = Path(__file__).parent
-DATA = ("hammer", "hopper", "hopper-ladder", "inverted-double-pendulum", "mountain-car", "relocate")
+DATA = ("hammer", "hopper", "hopper-mixed-quality", "inverted-double-pendulum", "mountain-car", "relocate")
 OURS = (*BASELINES, *ALGORITHMS)
 NAMES = {
     "bc": "BC",
@@ -67,7 +67,7 @@ def points(n_steps: int) -> list[int]:
     return [*(step for step in found if step < n_steps), n_steps]
 
 
-class Cell:
+class Training:
     """
     A training: its environments, and a row for each evaluation.
 
@@ -129,60 +129,60 @@ class Reached(Exception):  # noqa: N818 - no error
 class Evaluations(BaseCallback):
     """Evaluates at :func:`points` and stops the clock for it."""
 
-    def __init__(self, cell: Cell, n_steps: int) -> None:
+    def __init__(self, training: Training, n_steps: int) -> None:
         super().__init__()
-        self.cell, self.points = cell, set(points(n_steps))
+        self.training, self.points = training, set(points(n_steps))
         self.started = time.process_time()
 
     def _on_step(self) -> bool:
         if self.num_timesteps in self.points:
             paused = time.process_time()
-            if self.cell.evaluate(self.model, self.num_timesteps, IMPORTED + paused - self.started):
+            if self.training.evaluate(self.model, self.num_timesteps, IMPORTED + paused - self.started):
                 raise Reached
             self.started += time.process_time() - paused
         return True
 
 
-def run_here(job: Job) -> Cell:
+def run_here(job: Job) -> Training:
     """DT, DTFM or behaviour cloning, in this process."""
-    algo, settings = job.cell.algo, dict(job.settings)
-    cell = Cell(job, algo)
+    algo, settings = job.key.algo, dict(job.settings)
+    training = Training(job, algo)
     n_steps = settings["n_timesteps"]
-    callback = Evaluations(cell, n_steps)
+    callback = Evaluations(training, n_steps)
     with contextlib.suppress(Reached):
         if algo in BASELINES:
-            buffer = cell.buffer().best(best_share=settings["best_share"])
-            model = Cloning(buffer, settings["hidden_sizes"], settings["learning_rate"], job.cell.seed)
+            buffer = training.buffer().best(best_share=settings["best_share"])
+            model = Cloning(buffer, settings["hidden_sizes"], settings["learning_rate"], job.key.seed)
             model.learn(n_steps, settings["batch_size"], callback)
         else:
             apart = {"policy", "n_timesteps", "dataset", "dataset_kwargs"}
             own = {key: value for key, value in settings.items() if key not in {*apart, "env_wrapper", "env_kwargs"}}
             learner = ALGORITHMS[algo](
-                settings["policy"], cell.vec_env, dataset=cell.buffer(), seed=job.cell.seed, device="cpu", **own
+                settings["policy"], training.vec_env, dataset=training.buffer(), seed=job.key.seed, device="cpu", **own
             )
             learner.learn(n_steps, callback=callback, log_interval=None)
-    return cell
+    return training
 
 
-def run_baseline(job: Job, baseline: Baseline, python: Path, log: Path) -> Cell:
+def run_baseline(job: Job, baseline: Baseline, python: Path, log: Path) -> Training:
     """One of d3rlpy's, in a process of its own."""
-    cell = Cell(job, baseline.name)
+    training = Training(job, baseline.name)
     settings = {**baseline.settings, **baseline.kinds.get(kind(job), {})}
     with tempfile.TemporaryDirectory() as folder, BaselineProcess(python, WORKERS[baseline.worker], log) as process:
         path = Path(folder) / "episodes.npz"
-        cell.buffer().save(path)
-        process.begin(path, settings, job.cell.seed, baseline.n_timesteps, MINUTES)
+        training.buffer().save(path)
+        process.begin(path, settings, job.key.seed, baseline.n_timesteps, MINUTES)
         more: Row = {"profile": PROFILE, "settings": {**job.settings, "minutes": MINUTES, baseline.worker: settings}}
         done = 0
         for step in points(baseline.n_timesteps):
             seconds = process.learn(step - done)
             done = step
             versions = {f"baseline's {name}": number for name, number in process.versions.items()}
-            if cell.evaluate(process, step, seconds, versions={**provenance.versions(), **versions}, **more):
+            if training.evaluate(process, step, seconds, versions={**provenance.versions(), **versions}, **more):
                 break
             if seconds * 2**0.5 > 60.0 * MINUTES:
                 break
-    return cell
+    return training
 
 
 def kind(job: Job) -> str:
@@ -192,7 +192,7 @@ def kind(job: Job) -> str:
 
 
 def planned(options: argparse.Namespace, data: str, algo: str, seed: int) -> Job:
-    """The grid's job of a cell, whatever results there are."""
+    """The grid's job of a run, whatever results there are."""
     arguments = f"--datasets {HERE / 'suite.yml'} --env {data} --algo {algo} --fractions 1 --seeds {seed}".split()
     changes = ["-params", *options.hyperparams] if options.hyperparams else []
     more = ["-n", str(options.steps), "--label", options.label, *changes, "-o", "nowhere"]
@@ -200,24 +200,25 @@ def planned(options: argparse.Namespace, data: str, algo: str, seed: int) -> Job
     return job
 
 
-def run_cell(options: argparse.Namespace, data: str, algo: str, seed: int, path: Path) -> None:
-    """One cell, in this process."""
+def run_one(options: argparse.Namespace, data: str, algo: str, seed: int, path: Path) -> None:
+    """One run, in this process."""
     job = planned(options, data, algo if algo in OURS else "dt", seed)
     if algo in OURS:
-        cell = run_here(job)
+        training = run_here(job)
     else:
         baselines = read_entries(HERE / "baselines" / "settings.yml", Baseline)
-        cell = run_baseline(job, baselines[algo], options.python, path.with_suffix(".log"))
-    cell.write(path)
-    last = cell.rows[-1]
+        training = run_baseline(job, baselines[algo], options.python, path.with_suffix(".log"))
+    training.write(path)
+    last = training.rows[-1]
     value = reached(Episodes(last["returns"], [], last["successes"]))
     print(
-        f"{path.stem}: {value:,.2f} of {cell.enough:,.2f} after {last['wall_s']:.0f} s, {last['step']:,} steps", flush=True
+        f"{path.stem}: {value:,.2f} of {training.enough:,.2f} after {last['wall_s']:.0f} s, {last['step']:,} steps",
+        flush=True,
     )
 
 
 def run(options: argparse.Namespace) -> None:
-    """The cells that are not finished, each in a process of its own."""
+    """The runs that are not finished, each in a process of its own."""
     locks = options.results / ".locks"
     locks.mkdir(parents=True, exist_ok=True)
     for seed, data, algo in product(options.seeds, options.data, options.algo):
@@ -229,7 +230,7 @@ def run(options: argparse.Namespace) -> None:
                 subprocess.run([sys.executable, __file__, *sys.argv[1:], *one], check=True)
 
 
-def seconds_by_cell(results: Path) -> dict[tuple[str, str], list[tuple[float, bool]]]:
+def seconds_by_algorithm(results: Path) -> dict[tuple[str, str], list[tuple[float, bool]]]:
     """By data and algorithm, of each seed: the seconds, and whether it had reached what is enough by then."""
     found: dict[tuple[str, str], list[tuple[float, bool]]] = {}
     (rows,) = read_results([results]).values()
@@ -242,12 +243,14 @@ def seconds_by_cell(results: Path) -> dict[tuple[str, str], list[tuple[float, bo
 
 def table(folder: Path) -> str:
     """Seconds of each seed; in brackets where it ended without enough."""
-    cells = seconds_by_cell(folder)
-    algos = sorted({algo for _, algo in cells}, key=lambda algo: (list(NAMES).index(algo.split("@")[0]), algo))
+    seconds_of = seconds_by_algorithm(folder)
+    algos = sorted({algo for _, algo in seconds_of}, key=lambda algo: (list(NAMES).index(algo.split("@")[0]), algo))
     lines = ["| data | " + " | ".join(NAMES.get(algo, algo) for algo in algos) + " |", "| --- " * (1 + len(algos)) + "|"]
-    for data in dict.fromkeys(data for data, _ in cells):
+    for data in dict.fromkeys(data for data, _ in seconds_of):
         texts = [
-            ", ".join(f"{seconds:.0f}" if enough else f"({seconds:.0f})" for seconds, enough in cells.get((data, algo), []))
+            ", ".join(
+                f"{seconds:.0f}" if enough else f"({seconds:.0f})" for seconds, enough in seconds_of.get((data, algo), [])
+            )
             for algo in algos
         ]
         lines.append(f"| {data} | " + " | ".join(text or "-" for text in texts) + " |")
@@ -256,13 +259,13 @@ def table(folder: Path) -> str:
 
 def draw(folder: Path, path: Path) -> None:
     """A mark for each seed; a hollow one ended without enough."""
-    cells = seconds_by_cell(folder)
-    algos = [algo for algo in NAMES if any(algo == each for _, each in cells)]
-    names = list(dict.fromkeys(data for data, _ in cells))[::-1]
+    seconds_of = seconds_by_algorithm(folder)
+    algos = [algo for algo in NAMES if any(algo == each for _, each in seconds_of)]
+    names = list(dict.fromkeys(data for data, _ in seconds_of))[::-1]
     figure, axes = plt.subplots(figsize=(8, 0.3 + 0.75 * len(names)), layout="constrained")
     for i, algo in enumerate(algos):
         for y, data in enumerate(names):
-            for seconds, enough in cells.get((data, algo), []):
+            for seconds, enough in seconds_of.get((data, algo), []):
                 height = y + 0.7 * (0.5 - (i + 0.5) / len(algos))
                 axes.plot(seconds, height, "o", color=f"C{i}", mfc=f"C{i}" if enough else "none", ms=5)
         axes.plot([], [], "o", color=f"C{i}", label=NAMES[algo])
@@ -293,7 +296,7 @@ def main() -> None:
     parser.add_argument("--figure", type=Path, help="PNG file to draw")
     options = parser.parse_args()
     if options.write:
-        run_cell(options, *options.data, *options.algo, *options.seeds, options.write)
+        run_one(options, *options.data, *options.algo, *options.seeds, options.write)
     elif options.what == "run":
         run(options)
     else:

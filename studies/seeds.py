@@ -17,36 +17,36 @@ from sb3_dtfm.benchmark.report.figures import STYLES
 from sb3_dtfm.benchmark.report.runs import Run, read_studies
 from sb3_dtfm.benchmark.report.statistics import student_t
 
-Cells = dict[tuple[str, str], list[Run]]  # by what stands below, and the algorithm
+Grouped = dict[tuple[str, str], list[Run]]  # by what stands below, and the algorithm
 
 
-def read(folder: Path, labels: list[str]) -> Cells:
+def read(folder: Path, labels: list[str]) -> Grouped:
     """The runs of some labels, by task or, where there is one task only, by the number of episodes learned from."""
     groups = [group for study in read_studies([folder]) for group in study.groups if group.label in labels]
     if not groups:
         raise SystemExit(f"{folder} holds no rows of the labels {labels}.")
     one_task = len({task for group in groups for task, _, _ in group.runs}) == 1
-    cells: Cells = {}
+    grouped: Grouped = {}
     for group in groups:
         for (task, share, algo), runs in sorted(group.runs.items()):
             episodes = round(share * runs[0].final["data"]["n_episodes"])
-            cells.setdefault((f"{episodes}" if one_task else task.partition("-v")[0], algo), []).extend(runs)
-    return cells
+            grouped.setdefault((f"{episodes}" if one_task else task.partition("-v")[0], algo), []).extend(runs)
+    return grouped
 
 
-def draw(cells: Cells, path: Path, below: str) -> None:
+def draw(grouped: Grouped, path: Path, below: str) -> None:
     """
-    :param cells: what to show
+    :param grouped: what to show
     :param path: of the PNG
     :param below: what stands below the axis
     """
-    places = list(dict.fromkeys(place for place, _ in cells))
+    places = list(dict.fromkeys(place for place, _ in grouped))
     figure = Figure(figsize=(1.6 + 1.5 * len(places), 3.6), layout="constrained")
     FigureCanvasAgg(figure)
     axis = figure.add_subplot()
     for aside, algo, (color, marker) in zip((-0.13, 0.13), ("dt", "dtfm"), cycle(STYLES), strict=False):
         for x, place in enumerate(places):
-            values = np.array([run.value("final") for run in cells.get((place, algo), [])], float)
+            values = np.array([run.value("final") for run in grouped.get((place, algo), [])], float)
             at = x + aside
             axis.plot(np.full(len(values), at + 0.06), values, ".", color=color, alpha=0.6)
             if len(values) > 1:
@@ -54,7 +54,7 @@ def draw(cells: Cells, path: Path, below: str) -> None:
                 axis.plot([at, at], [low, high], color=color, linewidth=1.8)
                 axis.plot(at, estimate, color=color, marker=marker, markersize=6)
         axis.plot([], [], color=color, marker=marker, label=algo.upper())
-    runs = next(iter(cells.values()))
+    runs = next(iter(grouped.values()))
     axis.set_xticks(range(len(places)), places)
     axis.set_xlabel(below)
     axis.set_ylabel("success, %" if runs[0].counts_success else "return")

@@ -1,5 +1,5 @@
 """
-The results of a study as a table: one line for each cell, a value for each seed, and the commits that they come from.
+The results of a study as a table: a line for each task, share and algorithm, a value for each seed, and the commits.
 
     python studies/summary.py results/windows.csv       # or a folder of rows
     python studies/summary.py results/*.csv             # of several, what results/README.md says of each
@@ -49,8 +49,8 @@ def milliseconds(runs: Sequence[Run]) -> str:
 def about(path: Path) -> dict[str, str]:
     """The line of a study in results/README.md."""
     runs = [run for study in read_studies([path]) for group in study.groups for of in group.runs.values() for run in of]
-    algos = sorted({run.cell.algo for run in runs}, key=lambda algo: (algo not in PAPER_ALGORITHMS, algo))
-    seeds = sorted({run.cell.seed for run in runs})
+    algos = sorted({run.key.algo for run in runs}, key=lambda algo: (algo not in PAPER_ALGORITHMS, algo))
+    seeds = sorted({run.key.seed for run in runs})
     commits = [commit for commit, _ in Counter(run.commit for run in runs).most_common()]
     return {
         "study": f"[{path.stem}]({path.name})",
@@ -80,7 +80,7 @@ def lines(path: Path) -> Iterable[dict[str, str]]:
                 "task": task,
                 "data": f"{share:.0%}",
                 "algorithm": algo.upper(),
-                "seeds": ", ".join(str(run.cell.seed) for run in runs),
+                "seeds": ", ".join(str(run.key.seed) for run in runs),
                 **{name: NONE if set(each) == {NONE} else "; ".join(each) for name, each in values.items()},
                 "minutes": f"{np.mean([run.minutes for run in runs]):.1f}",
                 "ms an action": milliseconds(runs),

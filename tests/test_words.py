@@ -15,9 +15,11 @@ GONE = (
     # classes and functions
     "CorrectionVecEnv", "SteeredDTFM", "act_from_noise", "carry_out", "own_noise", "hand_out", "take_up", "threads_that_pay",
     "n_products", "from_first", "first_of_each_machine_first", "_memory_errors_named", "naming_the_file", "naming",
+    "asking_for", "asked_for", "keep_pace", "finished_cells",
     # prose
     "guided", "steer", "steers", "steered", "steering", "gait", "gaits", "lucky", "luckiest", "peer", "peers", "in sight",
     "what is asked for", "what is seen", "likewise", "goes on online", "going on online", "small profile", "drowns",
+    "return to ask for", "target's pace", "ladder",
 )  # fmt: skip
 WORD = re.compile(rf"(?<!\w)({'|'.join(GONE)})(?!\w)", re.IGNORECASE)
 

@@ -69,5 +69,5 @@ def camera_args(names: Sequence[str], size: int) -> dict[str, Any]:
 
 
 def image_key(camera: str) -> str:
-    """What robomimic calls a camera's image."""
+    """Name of a camera's image in robomimic."""
     return f"{camera}_image"

@@ -1,4 +1,4 @@
-"""What robosuite observes, read after a step."""
+"""Observations of robosuite, read after a step."""
 
 from typing import Any
 

@@ -11,8 +11,8 @@ from sb3_dtfm.policies import DTPolicy
 
 class DT(OfflineAlgorithm):
     """
-    Decision Transformer (Chen et al., 2021): the action is regressed, under a tanh, from the trunk's hidden state. Of a
-    Discrete action space it is one of n, by cross-entropy.
+    Decision Transformer (Chen et al., 2021): the action is regressed, under a tanh, from the Transformer's hidden state.
+    Discrete actions are learned by cross-entropy.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = dict.fromkeys(POLICY_NAMES, DTPolicy)

@@ -11,7 +11,7 @@ from sb3_dtfm.policies import DTFMPolicy
 
 class DTFM(OfflineAlgorithm):
     """
-    Decision Transformer with flow matching: the trunk's hidden state conditions a vector field from noise to action.
+    Decision Transformer with flow matching: the Transformer's hidden state conditions a vector field from noise to action.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = dict.fromkeys(POLICY_NAMES, DTFMPolicy)

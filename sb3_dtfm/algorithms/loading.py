@@ -1,4 +1,4 @@
-"""What a model's file says, as plain data, each checked before it is used."""
+"""Content of a model's file, as plain data, each checked before it is used."""
 
 import contextlib
 import io
@@ -118,7 +118,7 @@ def read_saved(
     print_system_info: bool,
 ) -> SavedModel:
     """
-    What a file says of a model: plain data, each checked by its own rule.
+    A file's description of a model: plain data, each checked by its own rule.
 
     :param path: the file
     :param policies: the algorithm's, by alias

@@ -151,7 +151,7 @@ class SequenceModel(BaseAlgorithm):
         Act in another environment from now on.
 
         :param env: of the model's sizes and range of actions; the bounds of observations may differ, since the policy
-            normalises them itself. It is wrapped as in the constructor, and asks for the model's `target_return` where it
+            normalises them itself. It is wrapped as in the constructor, and takes the model's `target_return` where it
             has no target of its own
         :param force_reset: as in SB3
         :raises ValueError: it does not fit

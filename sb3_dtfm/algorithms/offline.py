@@ -279,8 +279,8 @@ class OfflineAlgorithm(SequenceModel):
             if self.env is not None:
                 share_target_return(self.env, self.target_return)
                 if self.verbose >= 1 and is_first_process():
-                    asked = f"The environment asks for target_return={self.target_return:g}"
-                    print(f"{asked}, as `sb3-dtfm inspect` suggests of the recorded returns.", flush=True)
+                    chosen = f"The environment has target_return={self.target_return:g}"
+                    print(f"{chosen}, as `sb3-dtfm inspect` suggests of the recorded returns.", flush=True)
         self.return_reference = return_reference(buffer)
         return buffer
 
@@ -501,7 +501,7 @@ class OfflineAlgorithm(SequenceModel):
         return {name: total / n_steps for name, total in sums.items()}
 
     def _sample_transitions(self, batch_size: int, generator: th.Generator) -> Transitions:
-        """What the critic learns from."""
+        """Data of the critic."""
         assert self.buffer is not None
         return self.buffer.sample_transitions(batch_size, self.policy.critic_horizon, self.policy.options.gamma, generator)
 

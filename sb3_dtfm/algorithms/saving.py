@@ -1,4 +1,4 @@
-"""What of a model is saved, as JSON and tensors."""
+"""The saved parts of a model, as JSON and tensors."""
 
 import json
 import math
@@ -90,7 +90,7 @@ def _plain(value: Any) -> Any:
 
 
 def head_name(policies: Mapping[str, type[BasePolicy]]) -> str:
-    """What a file calls an algorithm: as the head of its policies does, whatever its class is."""
+    """Name of an algorithm in a file: as the head of its policies does, whatever its class is."""
     policy = policies["MultiInputPolicy"]
     assert issubclass(policy, SequencePolicy)
     return policy.head_class.algorithm

@@ -1,9 +1,9 @@
 """
-Behaviour cloning by a plain network: a baseline, as a cell of the benchmark in a process of its own.
+Behaviour cloning by a plain network: a baseline, as a run of the benchmark in a process of its own.
 
     python -m sb3_dtfm.benchmark.cloning settings.yml
 
-`settings.yml` is what the grid writes for each of its cells, see :mod:`~sb3_dtfm.benchmark.runner`.
+`settings.yml` is what the grid writes for each of its runs, see :mod:`~sb3_dtfm.benchmark.runner`.
 """
 
 import argparse
@@ -95,12 +95,14 @@ class Cloning:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """
-    Run a cell.
+    Train and evaluate one run.
 
     :param argv: its arguments; those of the process by default
     """
-    parser = argparse.ArgumentParser(prog="python -m sb3_dtfm.benchmark.cloning", description="Run a cell of `benchmark`.")
-    parser.add_argument("settings", type=Path, help="YAML file of the cell")
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_dtfm.benchmark.cloning", description="Train and evaluate one run of `benchmark`."
+    )
+    parser.add_argument("settings", type=Path, help="YAML file of the run")
     parser.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE")
     options = parser.parse_args(argv)
     import_packages(options.gym_packages)

@@ -23,7 +23,7 @@ from sb3_dtfm.zoo.comparison import RandomActions
 # First seeds of the two sets of initial states: apart from each other, and from those of recordings, which count from 0.
 TRAINING_STATES = 1_000_000
 FINAL_STATES = 2_000_000
-# What a cell prints for the grid that reads its output: steps done, steps in all, what it is doing.
+# A run prints these for the grid that reads its output: steps done, steps in all, what it is doing.
 PROGRESS = re.compile(r"step (\d+) of (\d+): (.*)\n")
 PROGRESS_INTERVAL = 0.5  # seconds
 TIMED_BLOCKS, TIMED_ACTIONS = 8, 16
@@ -49,7 +49,7 @@ class SeededEpisodes(gym.Wrapper):
     Each episode starts from the seed that was set for it, and after the last one of these the environment rests.
 
     A vector environment resets by itself and without a seed; what an episode starts from would then depend on those before.
-    And it steps all of its environments, also those that nobody waits for. One that rests stands at a start.
+    And it steps all of its environments, also those that are done. One that rests stands at a start.
 
     The first environment of its kind is reset twice, and a warning says so if it does not start from its seed.
     """
@@ -58,7 +58,7 @@ class SeededEpisodes(gym.Wrapper):
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
-        self._seeds: list[int] | None = None  # nobody has set any
+        self._seeds: list[int] | None = None  # none set yet
         self._start: tuple[Any, dict[str, Any]] | None = None
         self._rests = False
 
@@ -170,12 +170,12 @@ def action_ms(model: BaseAlgorithm, vec_env: VecEnv, seed: int) -> float:
 class EvaluationCallback(BaseCallback):
     """
     Evaluate before the first gradient step, every `eval_freq` of them and after the last one, and write a row each time;
-    after the last one also on initial states of its own, which nobody could choose a model by, beside random actions.
+    after the last one also on initial states of its own, by which no model was chosen, beside random actions.
 
     A YAML file of RL-Zoo may name it under `callback:`; all arguments are plain data.
 
     :param rows: JSONL file to append to
-    :param row: what all rows say: the cell, `settings` and `data`, see :mod:`~sb3_dtfm.benchmark.rows`
+    :param row: what all rows say: the run, `settings` and `data`, see :mod:`~sb3_dtfm.benchmark.rows`
     :param eval_freq: gradient steps between two evaluations
     :param n_episodes: episodes of each
     :param n_final_episodes: episodes of the last one, on the other initial states
@@ -268,9 +268,9 @@ class EvaluationCallback(BaseCallback):
 
     def _report(self, what: str) -> None:
         """
-        Say how far the cell is. Where the grid that reads it is gone, the pipe is broken, and the cell ends with it.
+        Say how far the run is. Where the grid that reads it is gone, the pipe is broken, and the run ends with it.
 
-        :raises BrokenPipeError: nobody would take the rows
+        :raises BrokenPipeError: the grid is gone
         """
         if time.monotonic() - self._reported >= PROGRESS_INTERVAL:
             self._reported = time.monotonic()

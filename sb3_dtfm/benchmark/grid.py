@@ -1,4 +1,4 @@
-"""The cells that a grid asks for."""
+"""The runs of a grid."""
 
 import argparse
 import json
@@ -12,21 +12,21 @@ import gymnasium as gym
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.provenance import describe_data, read_data
-from sb3_dtfm.benchmark.rows import BASELINES, Cell, Row, read_rows
+from sb3_dtfm.benchmark.rows import BASELINES, Row, RunKey, read_rows
 from sb3_dtfm.benchmark.settings import (
     GRID_DATASET_KEYS,
     Task,
-    check_same_trunk,
+    check_same_transformer,
     cloning_settings,
     profile_name,
     read_yaml,
     task_settings,
 )
 from sb3_dtfm.data.inspection import suggested_target_return
-from sb3_dtfm.zoo.arguments import UsageError, asked_for, asking_for, import_packages
+from sb3_dtfm.zoo.arguments import UsageError, find_target_return, import_packages, with_target_return
 
 N_EVALUATIONS = 10  # of a run, unless --eval-freq says otherwise
-# What --algo takes.
+# Values of --algo.
 ALGOS = (*ALGORITHMS, *BASELINES)
 
 
@@ -60,16 +60,16 @@ ENTRY: dict[str, tuple[str, Callable[[Any], bool]]] = {
 @dataclass(frozen=True)
 class Job:
     """
-    One cell and all that its process needs.
+    A run and everything that its process needs.
 
-    :param cell: its identity
+    :param key: its identity
     :param task: the task and its data
     :param settings: what its process reads from a YAML file, RL-Zoo's `train` for example
     :param data: what the rows say of the dataset
     :param eval_freq: gradient steps between two evaluations
     """
 
-    cell: Cell
+    key: RunKey
     task: Task
     settings: dict[str, Any]
     data: dict[str, Any]
@@ -82,9 +82,9 @@ class Job:
 
     @property
     def row(self) -> Row:
-        """What all of its rows say."""
-        renamed = {} if self.task.env_id == self.cell.task else {"env_id": self.task.env_id}
-        return {**self.cell._asdict(), **renamed, "settings": self.settings, "data": self.data}
+        """Content that all of its rows share."""
+        renamed = {} if self.task.env_id == self.key.task else {"env_id": self.task.env_id}
+        return {**self.key._asdict(), **renamed, "settings": self.settings, "data": self.data}
 
 
 def read_tasks(options: argparse.Namespace) -> list[Task]:
@@ -146,37 +146,40 @@ def _read_datasets_file(path: Path) -> dict[str, Task]:
     return tasks
 
 
-def plan(options: argparse.Namespace) -> tuple[list[Job], list[Cell]]:
+def plan(options: argparse.Namespace) -> tuple[list[Job], list[RunKey]]:
     """
-    The cells still to run, and those that are finished. All settings and datasets are checked before anything runs.
+    The runs to start, and those that are finished. All settings and datasets are checked before anything runs.
 
     :param options: arguments of `sb3-dtfm benchmark`
-    :raises UsageError: settings that do not fit, or a finished cell of another length
+    :raises UsageError: settings that do not fit, or a finished run of another length
     :raises DatasetError: a dataset that cannot be read, or of another task
     """
     files = sorted(Path(options.results).rglob("*.jsonl"))  # in studies, too
-    finished = {Cell.of(row): row for file in files for row in read_rows(file) if row["final"]}
+    finished = {RunKey.of(row): row for file in files for row in read_rows(file) if row["final"]}
     profile = profile_name(options.profile)
     looked_at: dict[tuple[str, float], tuple[dict[str, Any], float]] = {}
     jobs: list[Job] = []
-    done: list[Cell] = []
+    done: list[RunKey] = []
     # Seeds outermost: a grid that is cut short has seen every task.
     for seed, task, regime in product(options.seeds, read_tasks(options), options.fractions):
         for algo, wanted in _settings(task, regime, options).items():
-            cell, asks = Cell(task.name, regime, algo, seed, profile, options.label), asked_for(wanted.get("env_wrapper"))
-            if (rows := Path(options.results) / f"{cell.file_name}.jsonl") in files and cell not in finished:
-                raise UsageError(f"{cell}: {rows} is there, without a final evaluation of this cell; move it away.")
-            if (cell not in finished or asks is None) and (task.name, regime) not in looked_at:
+            key, target = (
+                RunKey(task.name, regime, algo, seed, profile, options.label),
+                find_target_return(wanted.get("env_wrapper")),
+            )
+            if (rows := Path(options.results) / f"{key.file_name}.jsonl") in files and key not in finished:
+                raise UsageError(f"{key}: {rows} is there, without a final evaluation of this run; move it away.")
+            if (key not in finished or target is None) and (task.name, regime) not in looked_at:
                 looked_at[task.name, regime] = _look_at(task, wanted)
-            if asks is None:
+            if target is None:
                 suggested = looked_at[task.name, regime][1]
-                wanted["env_wrapper"] = asking_for(suggested, wanted.get("env_wrapper"))
-            if cell in finished:
-                _check_same(cell, finished[cell], wanted, options)
-                done.append(cell)
+                wanted["env_wrapper"] = with_target_return(suggested, wanted.get("env_wrapper"))
+            if key in finished:
+                _check_same(key, finished[key], wanted, options)
+                done.append(key)
                 continue
             eval_freq = options.eval_freq or max(1, int(wanted["n_timesteps"]) // N_EVALUATIONS)
-            jobs.append(Job(cell, task, wanted, looked_at[task.name, regime][0], eval_freq))
+            jobs.append(Job(key, task, wanted, looked_at[task.name, regime][0], eval_freq))
     return jobs, done
 
 
@@ -190,14 +193,14 @@ def _settings(task: Task, regime: float, options: argparse.Namespace) -> dict[st
         algo: task_settings(options.profile, algo, task, regime, options.n_timesteps, options.hyperparams)
         for algo in ALGORITHMS
     }
-    check_same_trunk(own, task.name)
+    check_same_transformer(own, task.name)
     cloning = {algo: cloning_settings(algo, own["dt"], options.n_timesteps) for algo in BASELINES}
     return {algo: {**own, **cloning}[algo] for algo in options.algos if algo in (task.algorithms or options.algos)}
 
 
 def _look_at(task: Task, settings: dict[str, Any]) -> tuple[dict[str, Any], float]:
     """
-    What the rows say of a task's data, and the return to ask for that a run's share of them suggests.
+    Description of a task's data for the rows, and the target return that a run's share of them suggests.
 
     :raises DatasetError: they cannot be read, or are of another task
     :raises UsageError: the environment cannot be made
@@ -213,9 +216,9 @@ def _look_at(task: Task, settings: dict[str, Any]) -> tuple[dict[str, Any], floa
     return {**described, **({"chosen_with": True} if task.chosen_with else {})}, suggested_target_return(share)
 
 
-def _check_same(cell: Cell, found: Row, wanted: dict[str, Any], options: argparse.Namespace) -> None:
+def _check_same(key: RunKey, found: Row, wanted: dict[str, Any], options: argparse.Namespace) -> None:
     """
-    Refuse to take a finished cell for one of other settings.
+    Refuse to take a finished run for one of other settings.
 
     :param found: its final row
     :param wanted: its settings now
@@ -223,7 +226,7 @@ def _check_same(cell: Cell, found: Row, wanted: dict[str, Any], options: argpars
     """
     there = {**found["settings"], "n_timesteps": found["step"], "--final-episodes": len(found["returns"])}
     now = {**json.loads(json.dumps(wanted)), "--final-episodes": options.final_episodes}
-    differing = sorted(key for key in {*there, *now} if there.get(key) != now.get(key))
+    differing = sorted(name for name in {*there, *now} if there.get(name) != now.get(name))
     if differing:
-        changes = ", ".join(f"{key} {there.get(key)!r} instead of {now.get(key)!r}" for key in differing)
-        raise UsageError(f"{cell}: {options.results} has it with {changes}; use another --label or --results.")
+        changes = ", ".join(f"{name} {there.get(name)!r} instead of {now.get(name)!r}" for name in differing)
+        raise UsageError(f"{key}: {options.results} has it with {changes}; use another --label or --results.")

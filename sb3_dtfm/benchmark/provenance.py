@@ -1,4 +1,4 @@
-"""Where a row comes from: the code, the machine, and the data."""
+"""Origin of a row: the code, the machine, and the data."""
 
 import contextlib
 import json

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_dtfm.benchmark.rows import Cell, Row, RowError, read_rows, refuse_constant
+from sb3_dtfm.benchmark.rows import Row, RowError, RunKey, read_rows, refuse_constant
 from sb3_dtfm.files.replacing import replacing
 
 Result = dict[str, Any]
@@ -101,12 +101,12 @@ COLUMNS = {
     "hardware": Column("hardware", _json, "run"),
     "versions": Column("versions", _versions, "run"),
 }
-# What is said of a run once, with its final evaluation.
+# Columns that a run fills once, with its final evaluation.
 OF_A_RUN = ("action_ms", "flow_solver", "flow_steps", "commit", "env_id", "data", "settings", "hardware", "versions")
 
 
 def summarize(row: Row) -> Result:
-    """What an evaluation came to."""
+    """Result of an evaluation."""
     returns, lengths, successes = (row[key] for key in ("returns", "lengths", "successes"))
     counts = {
         "n_episodes": len(returns),
@@ -132,7 +132,7 @@ def _rounded(value: Any) -> Any:
 
 def write_results(path: Path, results: Iterable[Result]) -> None:
     """Write a table, ordered by run and gradient step; a file that is there is replaced when it is whole."""
-    ordered = sorted(results, key=lambda result: (Cell.of(result), result["step"], result["final"]))
+    ordered = sorted(results, key=lambda result: (RunKey.of(result), result["step"], result["final"]))
     with replacing(path) as beside, beside.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
@@ -235,7 +235,7 @@ def _merged(files: Iterable[Path]) -> list[Result]:
     results: dict[tuple[Any, ...], tuple[Result, Path]] = {}
     for path in files:
         for result in read_table(path) if path.suffix == ".csv" else map(summarize, read_rows(path)):
-            key = (Cell.of(result), result["step"], result["final"])
+            key = (RunKey.of(result), result["step"], result["final"])
             known, where = results.setdefault(key, (result, path))
             if known != result:
                 what = f"different results of {key[0]}, step {key[1]}; keep one run of it, or give it a label."

@@ -31,9 +31,9 @@ class RowError(ValueError):
     """A row cannot be used. The message names file and line, what was found and what is accepted."""
 
 
-class Cell(NamedTuple):
+class RunKey(NamedTuple):
     """
-    What one training run of the grid is known by; rows with the same cell belong to the same run.
+    Identity of a training run; rows with equal keys belong to one run.
 
     :param task: name of the task with its data, which is the Gymnasium id where nothing else was said
     :param regime: share of its episodes, in (0, 1]
@@ -51,13 +51,13 @@ class Cell(NamedTuple):
     label: str = ""
 
     @classmethod
-    def of(cls, row: Row) -> "Cell":
-        """The cell that a row belongs to."""
+    def of(cls, row: Row) -> "RunKey":
+        """The key of the run that a row belongs to."""
         return cls(row["task"], float(row["regime"]), row["algo"], row["seed"], row["profile"], row["label"])
 
     @property
     def file_name(self) -> str:
-        """Name for files and folders of this cell: no separators, no spaces."""
+        """Name for files and folders of this run: no separators, no spaces."""
         parts = [self.task, f"{self.regime:g}", self.algo, f"seed{self.seed}", self.profile, self.label]
         return plain_name("_".join(part for part in parts if part))
 
@@ -143,6 +143,6 @@ def refuse_constant(constant: str) -> NoReturn:
     raise RowError(f"holds {constant}, expected numbers.")
 
 
-def finished_cells(rows: Iterable[Row]) -> dict[Cell, int]:
-    """Gradient steps of each cell that has its final evaluation."""
-    return {Cell.of(row): row["step"] for row in rows if row["final"]}
+def finished_runs(rows: Iterable[Row]) -> dict[RunKey, int]:
+    """Gradient steps of each run that has its final evaluation."""
+    return {RunKey.of(row): row["step"] for row in rows if row["final"]}

@@ -1,4 +1,4 @@
-"""Runs the cells of a grid, each as `sb3-dtfm train`, or behaviour cloning, in a process of its own."""
+"""Starts the runs of a grid, each as `sb3-dtfm train`, or behaviour cloning, in a process of its own."""
 
 import argparse
 import contextlib
@@ -24,7 +24,7 @@ from tqdm import tqdm
 from sb3_dtfm.benchmark.evaluation import PROGRESS
 from sb3_dtfm.benchmark.grid import Job
 from sb3_dtfm.benchmark.provenance import n_cores
-from sb3_dtfm.benchmark.rows import BASELINES, RowError, finished_cells, read_rows
+from sb3_dtfm.benchmark.rows import BASELINES, RowError, finished_runs, read_rows
 from sb3_dtfm.files import replacing
 from sb3_dtfm.zoo.resuming import START
 
@@ -37,9 +37,9 @@ PATIENCE = 10.0  # seconds that a process has to end after SIGTERM
 
 class Runner:
     """
-    Keeps `--jobs` cells running until none is left.
+    Keeps `--jobs` runs going until none is left.
 
-    :param jobs: cells to run, in this order
+    :param jobs: runs to start, in this order
     :param options: arguments of `sb3-dtfm benchmark`
     """
 
@@ -59,19 +59,19 @@ class Runner:
         self._bar = _bar("grid", sum(job.n_steps for job in jobs))
 
     def run(self) -> None:
-        """Run all cells; one that fails does not stop the others, an interrupt ends them."""
+        """Start all runs; one that fails does not stop the others, an interrupt ends them."""
         with self._bar, ThreadPoolExecutor(self.options.jobs) as pool:
-            cells = [pool.submit(self._run_cell, job) for job in self.jobs]
+            futures = [pool.submit(self._run_job, job) for job in self.jobs]
             try:
-                for cell in as_completed(cells):
-                    cell.result()
+                for future in as_completed(futures):
+                    future.result()
             finally:
                 pool.shutdown(wait=False, cancel_futures=True)
                 self._end_processes()
 
-    def _run_cell(self, job: Job) -> None:
-        """Run a cell, unless another call of the command is at it or has finished it meanwhile."""
-        name = job.cell.file_name
+    def _run_job(self, job: Job) -> None:
+        """Start a run, unless another call of the command is at it or has finished it meanwhile."""
+        name = job.key.file_name
         try:
             with contextlib.ExitStack() as locks:
                 # Either may be another call's, too, or both the same.
@@ -83,16 +83,16 @@ class Runner:
                 else:
                     self._train(job, self._prepare(job))
         except Timeout:
-            _say(f"{job.cell}: another process is running it")
+            _say(f"{job.key}: another process is running it")
             self.left.append(job)
 
     def _prepare(self, job: Job) -> Path:
         """
-        A folder with a cell's settings, new for each attempt: an orphan may still be writing into an older one.
+        A folder with a run's settings, new for each attempt: an orphan may still be writing into an older one.
 
         What the last attempt had come to is copied, if its settings were the same.
         """
-        logs, options, env_id = Path(self.options.log_folder) / job.cell.file_name, self.options, job.task.env_id
+        logs, options, env_id = Path(self.options.log_folder) / job.key.file_name, self.options, job.task.env_id
         logs.mkdir(parents=True, exist_ok=True)
         earlier = sorted(logs.glob("attempt-*"), key=lambda path: path.stat().st_mtime)
         folder = Path(tempfile.mkdtemp(prefix="attempt-", dir=logs))
@@ -122,23 +122,23 @@ class Runner:
         start = time.monotonic()
         with self._start(job, folder) as process:
             n_started = self._processes.index(process) + 1
-            _say(f"[{n_started}/{len(self.jobs)}] {job.cell}: {job.n_steps:,} gradient steps")
+            _say(f"[{n_started}/{len(self.jobs)}] {job.key}: {job.n_steps:,} gradient steps")
             self._follow(process, job, folder / OUTPUT)
         took = timedelta(seconds=round(time.monotonic() - start))
         if process.returncode == 0 and self._publish(job, folder / ROWS):
             self.done.append(job)
-            _say(f"{job.cell}: done in {took}")
+            _say(f"{job.key}: done in {took}")
         elif not self._stopping:
             self.failed.append(folder / OUTPUT)
-            _say(f"{job.cell}: FAILED after {took}, see {folder / OUTPUT}")
+            _say(f"{job.key}: FAILED after {took}, see {folder / OUTPUT}")
 
     def _start(self, job: Job, folder: Path) -> subprocess.Popen[str]:
         """
-        The cell's process.
+        The run's process.
 
         :raises CancelledError: the grid is being ended
         """
-        is_baseline = job.cell.algo in BASELINES
+        is_baseline = job.key.algo in BASELINES
         command = [*CLONE, str(folder / SETTINGS)] if is_baseline else self._train_command(job, folder)
         if packages := [*self.options.gym_packages, *job.task.gym_packages]:
             command += ["--gym-packages", *packages]
@@ -156,21 +156,21 @@ class Runner:
         return process
 
     def _train_command(self, job: Job, folder: Path) -> list[str]:
-        """`sb3-dtfm train` of a cell, which resumes from its checkpoint if it left one."""
-        command = [*TRAIN, "--algo", job.cell.algo, "--env", job.task.env_id, "--seed", str(job.cell.seed)]
+        """`sb3-dtfm train` of a run, which resumes from its checkpoint if it left one."""
+        command = [*TRAIN, "--algo", job.key.algo, "--env", job.task.env_id, "--seed", str(job.key.seed)]
         command += ["--conf-file", str(folder / SETTINGS), "--log-folder", str(folder / LOGS), "--eval-freq", "-1"]
         command += ["--verbose", "0", "--device", self.options.device, "--num-threads", str(self._n_threads)]
         # RL-Zoo's name for an attempt's only run.
-        run = folder / LOGS / job.cell.algo / f"{EnvironmentName(job.task.env_id)}_1"
+        run = folder / LOGS / job.key.algo / f"{EnvironmentName(job.task.env_id)}_1"
         if (run / START).is_file() and (folder / ROWS).is_file():
             command += ["--resume", str(run)]
         return command
 
     def _follow(self, process: subprocess.Popen[str], job: Job, log: Path) -> None:
-        """Show how far the cell is, and keep what else it prints, until it ends."""
+        """Show how far the run is, and keep what else it prints, until it ends."""
         assert process.stdout is not None
-        cell = job.cell
-        name = f"{cell.task} {cell.regime:.0%} {cell.algo} seed {cell.seed} {cell.label}".strip()
+        key = job.key
+        name = f"{key.task} {key.regime:.0%} {key.algo} seed {key.seed} {key.label}".strip()
         with log.open("w", buffering=1) as file, _bar(name, job.n_steps) as bar:
             for line in process.stdout:
                 found = PROGRESS.fullmatch(line)
@@ -178,7 +178,7 @@ class Runner:
                     file.write(line)
                     continue
                 bar.set_postfix_str(found[3], refresh=False)
-                self._bar.set_postfix_str(f"{len(self.done)} of {len(self.jobs)} cells", refresh=False)
+                self._bar.set_postfix_str(f"{len(self.done)} of {len(self.jobs)} runs", refresh=False)
                 n_new = int(found[1]) - bar.n
                 bar.update(n_new)
                 self._bar.update(n_new)
@@ -187,16 +187,16 @@ class Runner:
     def _publish(self, job: Job, rows: Path) -> bool:
         """Make the rows appear in the results all at once; False if the final evaluation is not among them."""
         try:
-            if job.cell not in finished_cells(read_rows(rows)):
+            if job.key not in finished_runs(read_rows(rows)):
                 return False
         except (FileNotFoundError, RowError):
             return False
-        with replacing(self.results / f"{job.cell.file_name}.jsonl") as beside:
+        with replacing(self.results / f"{job.key.file_name}.jsonl") as beside:
             shutil.copyfile(rows, beside)
         return True
 
     def _end_processes(self) -> None:
-        """End the cells and what they started for their environments."""
+        """End the runs and what they started for their environments."""
         with self._lock:
             self._stopping = True
         running = [process for process in self._processes if process.poll() is None]
@@ -225,24 +225,24 @@ def run_grid(jobs: Sequence[Job], n_finished: int, options: argparse.Namespace) 
     """
     Run what is left of a grid, and say what became of it.
 
-    :param jobs: cells to run
-    :param n_finished: cells that are not to be run again
+    :param jobs: runs to start
+    :param n_finished: runs that are not started again
     :param options: arguments of `sb3-dtfm benchmark`
-    :raises SystemExit: with code 1 if a cell failed or was left to another process, 130 if interrupted
+    :raises SystemExit: with code 1 if a run failed or was left to another process, 130 if interrupted
     """
-    print(f"{len(jobs)} cells to run, {n_finished} finished already in {options.results}", flush=True)
+    print(f"{len(jobs)} runs to start, {n_finished} finished already in {options.results}", flush=True)
     runner = Runner(jobs, options)
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         runner.run()
     except KeyboardInterrupt:
-        print(f"Interrupted after {len(runner.done)} of {len(jobs)} cells; the same command goes on.", flush=True)
+        print(f"Interrupted after {len(runner.done)} of {len(jobs)} runs; the same command goes on.", flush=True)
         raise SystemExit(130) from None
     finally:
         signal.signal(signal.SIGTERM, before)
     if runner.failed or runner.left:
-        print(f"{len(runner.failed)} of {len(jobs)} cells failed, {len(runner.left)} are left to other processes.")
+        print(f"{len(runner.failed)} of {len(jobs)} runs failed, {len(runner.left)} are left to other processes.")
         for log in runner.failed:
             print(f"{log}: {(log.read_text().strip().splitlines() or ['nothing was written'])[-1]}")
         raise SystemExit(1)
-    print(f"All {len(jobs) + n_finished} cells are finished: sb3-dtfm report {options.results}", flush=True)
+    print(f"All {len(jobs) + n_finished} runs are finished: sb3-dtfm report {options.results}", flush=True)

@@ -1,4 +1,4 @@
-"""Settings of a profile for one cell: what RL-Zoo's `train` reads from its YAML file."""
+"""Settings of a profile for one run: what RL-Zoo's `train` reads from its YAML file."""
 
 import copy
 import inspect
@@ -11,7 +11,7 @@ import yaml
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.rows import BASELINES
-from sb3_dtfm.zoo.arguments import UsageError, asking_for
+from sb3_dtfm.zoo.arguments import UsageError, with_target_return
 from sb3_dtfm.zoo.registration import packaged_config, policy_of, with_policy_options
 
 PROFILES = {"default": None, "paper": "paper"}
@@ -31,7 +31,7 @@ CLONING = {"n_timesteps": 5000, "batch_size": 256, "learning_rate": 1e-3, "hidde
 
 class Task(NamedTuple):
     """
-    What a user asks for one task beside the profile: an entry of the file of `--datasets`.
+    A user's settings of one task beside the profile: an entry of the file of `--datasets`.
 
     :param name: of the task with its data, by which rows and reports know it
     :param dataset: Minari id, robomimic file or flat arrays, None for the profile's
@@ -65,7 +65,7 @@ class Task(NamedTuple):
 
 
 def profile_name(profile: str) -> str:
-    """What rows call a profile: its own name, or that of its file or folder."""
+    """Name of a profile in rows: its own, or that of its file or folder."""
     return profile if profile in PROFILES else Path(profile).stem
 
 
@@ -110,7 +110,7 @@ def task_settings(
     profile: str, algo: str, task: Task, regime: float, n_timesteps: int | None, hyperparams: dict[str, Any]
 ) -> dict[str, Any]:
     """
-    Everything that RL-Zoo's `train` is to read for one cell, but the seed.
+    Everything that RL-Zoo's `train` is to read for one run, but the seed.
 
     Settings that only another algorithm knows are left out, so that one file or one `-params` serves all.
 
@@ -126,7 +126,7 @@ def task_settings(
     """
     settings = read_profile(profile, algo, task.env_id)
     if task.dataset is not None and "dataset" in settings:  # to which the target return belongs
-        settings["env_wrapper"] = asking_for(None, settings.get("env_wrapper"))
+        settings["env_wrapper"] = with_target_return(None, settings.get("env_wrapper"))
     hyperparams = with_policy_options(hyperparams)
     policy_kwargs = {**_mapping(settings, "policy_kwargs"), **_mapping(hyperparams, "policy_kwargs")}
     merged = {key: {**_mapping(settings, key), **getattr(task, key), **_mapping(hyperparams, key)} for key in MERGED}
@@ -140,7 +140,7 @@ def task_settings(
     if task.dataset is not None:
         settings["dataset"] = task.dataset
     if task.target_return is not None:
-        settings["env_wrapper"] = asking_for(task.target_return, settings.get("env_wrapper"))
+        settings["env_wrapper"] = with_target_return(task.target_return, settings.get("env_wrapper"))
     if n_timesteps is not None:
         settings["n_timesteps"] = n_timesteps
     needed = {"dataset": "--dataset", "n_timesteps": "--n-timesteps"}
@@ -157,7 +157,7 @@ def task_settings(
 
 def cloning_settings(algo: str, settings: Mapping[str, Any], n_timesteps: int | None) -> dict[str, Any]:
     """
-    What a cell of behaviour cloning is to read.
+    Settings of a run of behaviour cloning.
 
     :param algo: one of `BASELINES`
     :param settings: of DT or DTFM, whose data and environment are its own, too
@@ -168,7 +168,7 @@ def cloning_settings(algo: str, settings: Mapping[str, Any], n_timesteps: int | 
     return {**shared, **CLONING, **asked, "best_share": BASELINES[algo]}
 
 
-def check_same_trunk(settings: dict[str, dict[str, Any]], task: str) -> None:
+def check_same_transformer(settings: dict[str, dict[str, Any]], task: str) -> None:
     """
     Algorithms may differ in what not all of them know, and in nothing else.
 
@@ -199,7 +199,7 @@ def _known(settings: dict[str, Any], algo: str, parameters: Callable[[str], set[
     """
     The settings without those that only other algorithms know.
 
-    :raises UsageError: nobody knows one of them
+    :raises UsageError: one of them is unknown
     """
     unknown = set(settings).difference(*map(parameters, ALGORITHMS))
     if unknown:
@@ -208,10 +208,10 @@ def _known(settings: dict[str, Any], algo: str, parameters: Callable[[str], set[
 
 
 def _constructor_parameters(algo: str) -> set[str]:
-    """What may stand in a YAML file: arguments of the algorithm, and RL-Zoo's own."""
+    """Keys of a YAML file: arguments of the algorithm, and RL-Zoo's own."""
     return ZOO_KEYS | set(inspect.signature(ALGORITHMS[algo]).parameters)
 
 
 def _policy_parameters(algo: str) -> set[str]:
-    """What may stand in its `policy_kwargs`."""
+    """Keys of its `policy_kwargs`."""
     return policy_of(algo).parameter_names()

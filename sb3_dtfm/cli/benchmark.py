@@ -19,7 +19,7 @@ examples:
 The file of --datasets maps a task to its dataset, or to some of these keys:
   task            Gymnasium id, where the entry has a name of its own: several entries may have the same task
   dataset         Minari id, robomimic file or flat arrays; the profile's by default
-  target_return   to ask for, in reward units; what `sb3-dtfm inspect` suggests of the dataset by default
+  target_return   in reward units; what `sb3-dtfm inspect` suggests of the dataset by default
   recorded_from   the agent or demonstrator, for the report
   env_kwargs      of the environment
   dataset_kwargs  of the dataset's reader: clip_actions, action_bounds and others
@@ -31,7 +31,7 @@ The file of --datasets maps a task to its dataset, or to some of these keys:
   robosuite/Lift-v0: datasets/lift.hdf5
   cheetah: {task: HalfCheetah-v5, dataset: local/halfcheetah/expert-v0, recorded_from: "TQC, sampled actions"}
 
-A cell that is finished in the results folder is not run again; one that was interrupted goes on from its checkpoint.
+A run that is finished in the results folder is not started again; one that was interrupted goes on from its checkpoint.
 """
 
 
@@ -61,12 +61,12 @@ def benchmark_parser() -> argparse.ArgumentParser:
     grid("--seeds", "--seed", type=int, nargs="+", default=[0], metavar="SEED", help="0 by default")
     grid("--profile", default="default", help="default, paper, a YAML file, or a folder with dt.yml and dtfm.yml")
     grid("--gym-packages", nargs="+", default=[], metavar="MODULE", help="to import first: they register tasks")
-    grid("--label", default="", help="name of what -params change; part of a cell's identity")
+    grid("--label", default="", help="name of what -params change; part of a run's identity")
     data = parser.add_argument_group("data").add_argument
     data("--dataset", **several, metavar="TASK=DATASET", help="Minari id, robomimic file or flat arrays")
     data("--datasets", metavar="FILE", help="YAML file that says the same for many tasks, see below")
     data("--dataset-cache", metavar="DIR", help="learn from memory-mapped files made in this folder")
-    data("--target-return", **several, metavar="[TASK=]RETURN", help="to ask for when acting, in reward units")
+    data("--target-return", **several, metavar="[TASK=]RETURN", help="when acting, in reward units")
     training = parser.add_argument_group("training and evaluation").add_argument
     training("-n", "--n-timesteps", type=int, metavar="N", help="gradient steps; the profile's by default")
     training("-params", "--hyperparams", **several, metavar="KEY:VALUE", help="settings to change; needs --label")
@@ -78,7 +78,7 @@ def benchmark_parser() -> argparse.ArgumentParser:
     training("--vec-env", choices=("dummy", "subproc"), default="dummy", help="as in train")
     training("--device", default="auto", help="as in train")
     running = parser.add_argument_group("running").add_argument
-    running("--jobs", type=int, default=1, metavar="N", help="cells at once, each with 1/N of the cores; 1 by default")
+    running("--jobs", type=int, default=1, metavar="N", help="runs at once, each with 1/N of the cores; 1 by default")
     running("-o", "--results", default="results", metavar="DIR", help="where rows go; results by default")
     running("-f", "--log-folder", default="logs/benchmark", metavar="DIR", help="models and logs; logs/benchmark by default")
     return parser
@@ -118,7 +118,7 @@ def main(argv: Sequence[str]) -> None:
 
     :param argv: its arguments
     :raises UsageError: an argument, setting or dataset that does not fit; nothing was run
-    :raises SystemExit: with code 1 if a cell failed or was left to another process, 130 if interrupted
+    :raises SystemExit: with code 1 if a run failed or was left to another process, 130 if interrupted
     """
     options = parse_arguments(argv)
     import_packages(options.gym_packages)

@@ -32,7 +32,7 @@ EVALUATION_SEED = 10_000  # far from the training evaluations', which count up f
 
 def main(argv: Sequence[str]) -> None:
     """
-    Run `sb3-dtfm demo`. What an interrupted demo has finished is not repeated.
+    Run `sb3-dtfm demo`. Finished parts of an interrupted demo are not repeated.
 
     :param argv: its arguments
     """

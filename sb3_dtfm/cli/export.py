@@ -23,7 +23,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("model", metavar="MODEL", help="zip file, or folder of a run of `train`")
     parser.add_argument("--output", "-o", default="policy.onnx", metavar="FILE", help="policy.onnx by default")
     parser.add_argument("--env", metavar="ENV", help="Gymnasium id, for the file's metadata")
-    parser.add_argument("--target-return", type=float, metavar="R", help="to ask for, for the file's metadata")
+    parser.add_argument("--target-return", type=float, metavar="R", help="in reward units, for the file's metadata")
     parser.add_argument(
         "--acting",
         nargs="+",

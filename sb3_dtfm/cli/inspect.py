@@ -93,7 +93,7 @@ def _load_for(env_id: str, dataset: str | list[str], options: dict[str, Any]) ->
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="sb3-dtfm inspect",
-        description="Show what is in a dataset, what may be wrong with it, and a return to ask for.",
+        description="Show what is in a dataset, what may be wrong with it, and suggest a target return.",
     )
     argument = parser.add_argument
     argument("dataset", nargs="+", metavar="DATASET", help="Minari id, file or folder; or several")
@@ -224,7 +224,7 @@ def draw(buffer: TrajectoryBuffer, found: Inspection, output: Path, title: str) 
     n_bins = min(50, max(10, buffer.n_episodes // 4))
     returns.hist(buffer.episode_returns, bins=n_bins, color=BLUE)
     returns.axvline(found.target_return, color=RED, linestyle="--")
-    returns.set_title(f"to ask for: {found.target_return:,g}", color=RED, fontsize="medium")
+    returns.set_title(f"target return: {found.target_return:,g}", color=RED, fontsize="medium")
     returns.set(xlabel="return of an episode", ylabel="episodes")
     lengths.hist(buffer.episode_lengths, bins=n_bins, color=BLUE)
     lengths.set(xlabel="steps of an episode", ylabel="episodes")

@@ -11,7 +11,7 @@ from gymnasium.error import Error as GymnasiumError
 
 from sb3_dtfm import __version__
 
-# What a user's mistake is raised as: TypeError for an argument that somebody's constructor does not know.
+# Exceptions of a user's mistake: TypeError for an argument that a constructor does not know.
 EXPECTED_ERRORS = (ValueError, TypeError, AssertionError, OSError, ImportError, GymnasiumError)
 
 # Each is `main(argv)` in a module of this package that has its name, and is imported when it is asked for.
@@ -19,7 +19,7 @@ COMMANDS = {
     "train": "RL-Zoo's `train`, with dt and dtfm.",
     "enjoy": "RL-Zoo's `enjoy`, with dt and dtfm.",
     "finetune": "Go on learning online, from a trained DTFM.",
-    "inspect": "Show what is in a dataset, and a return to ask for.",
+    "inspect": "Show what is in a dataset, and suggest a target return.",
     "record": "Make a dataset from a trained agent or a scripted demonstrator.",
     "demo": "Record, train and evaluate on robosuite's Lift, start to end.",
     "video": "Film a trained model, as an MP4 or a GIF.",

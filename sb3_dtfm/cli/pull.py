@@ -29,7 +29,7 @@ def main(argv: Sequence[str]) -> None:
     ALGORITHMS[settings.algo].load(model, device="cpu")  # refuses what is damaged or holds pickles
     settings.write_run(run)
     hub.copy_model(model, run / f"{options.env}.zip")
-    print(f"Run: {run} (asks for {settings.target_return:g}, env_kwargs {settings.env_kwargs})")
+    print(f"Run: {run} (target return {settings.target_return:g}, env_kwargs {settings.env_kwargs})")
 
 
 def _new_run(options: argparse.Namespace) -> Path:

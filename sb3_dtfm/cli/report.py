@@ -20,7 +20,7 @@ def main(argv: Sequence[str]) -> None:
     Run `sb3-dtfm report`.
 
     :param argv: its arguments
-    :raises ValueError: a malformed argument or row, or no finished cell
+    :raises ValueError: a malformed argument or row, or no finished run
     :raises FileNotFoundError: no such folder or file
     """
     parser = argparse.ArgumentParser(
@@ -46,7 +46,7 @@ def main(argv: Sequence[str]) -> None:
         return
     studies = read_studies(options.results, options.tasks)
     if not any(study.groups for study in studies):
-        raise ValueError(f"{', '.join(options.results)}: no finished cell; `sb3-dtfm benchmark` writes some.")
+        raise ValueError(f"{', '.join(options.results)}: no finished run; `sb3-dtfm benchmark` writes some.")
     baselines = [read_baseline(text) for text in options.baseline]
     check_baselines(
         baselines, list(dict.fromkeys(task for study in studies for group in study.groups for task in group.tasks))

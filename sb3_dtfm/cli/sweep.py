@@ -1,4 +1,4 @@
-"""`sb3-dtfm sweep`: the return that models reach against the return that they are asked for."""
+"""`sb3-dtfm sweep`: the return that models reach against their target return."""
 
 import argparse
 import functools
@@ -32,9 +32,9 @@ SEED_STRIDE = 10_000
 SIGNIFICANT, N_SHUFFLES, FEWEST_EPISODES = 0.05, 1_999, 6
 
 
-class Asked(NamedTuple):
+class Reached(NamedTuple):
     """
-    Episodes of a model that was asked for one return.
+    Episodes of a model with one target return.
 
     :param target: in environment reward units
     :param returns: (n,) what the episodes reached
@@ -77,14 +77,14 @@ def main(argv: Sequence[str]) -> None:
     curves = dict(zip(names, reached, strict=True))
     print("\n".join(table(curves)))
     if len(targets) > 1:
-        print("\n".join(f"- {name}: {finding(asked)}" for name, asked in curves.items()))
+        print("\n".join(f"- {name}: {finding(reached)}" for name, reached in curves.items()))
     picture = draw(curves, returns, Path(options.output), options.env)
     numbers = picture.with_suffix(".json")
     origin = {"task": options.env, "dataset": options.dataset, "acting": acting, "first_state": first_state(options)}
-    asked = {name: [each._asdict() for each in reached] for name, reached in curves.items()}
+    numbers_of = {name: [each._asdict() for each in reached] for name, reached in curves.items()}
     with replacing(numbers) as beside:
         beside.write_text(
-            json.dumps({**origin, "commit": commit(), "versions": versions(), "models": asked}, indent=1) + "\n"
+            json.dumps({**origin, "commit": commit(), "versions": versions(), "models": numbers_of}, indent=1) + "\n"
         )
     print(f"\nPicture: {picture}\nReturns of all episodes: {numbers}")
 
@@ -92,7 +92,7 @@ def main(argv: Sequence[str]) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="sb3-dtfm sweep",
-        description="Ask models for one return after the other, and measure what they reach: a table and a picture.",
+        description="Evaluate models with one target return after the other: a table and a picture.",
     )
     argument = parser.add_argument
     argument("models", nargs="+", metavar="MODEL", help="zip file of dt or dtfm, or folder of a run of `train`")
@@ -102,7 +102,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     argument("--dataset-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="options of its reader")
     argument("--algo", choices=ALGORITHMS, help="of all models; by the folder dt or dtfm that they are in by default")
-    argument("--returns", nargs="+", type=float, metavar="R", help="to ask for; evenly over the dataset's by default")
+    argument(
+        "--returns", nargs="+", type=float, metavar="R", help="target returns; evenly over the dataset's returns by default"
+    )
     argument("--points", type=_at_least(2), default=9, metavar="N", help="how many then; 9 by default")
     argument("--episodes", type=_at_least(1), default=10, metavar="N", help="for each return; 10 by default")
     argument("--n-envs", type=_at_least(1), default=10, metavar="N", help="environments side by side; 10 by default")
@@ -152,14 +154,14 @@ def evenly(returns: np.ndarray, n: int) -> list[float]:
 
 def sweep(
     model: BaseAlgorithm, agent: AgentFiles, options: argparse.Namespace, targets: Sequence[float], progress: tqdm
-) -> list[Asked]:
+) -> list[Reached]:
     """
     Play episodes from the same initial states for each return.
 
     :param model: acts
     :param agent: says what its environment was in training
     :param options: of the command
-    :param targets: returns to ask for, environment reward units
+    :param targets: target returns, environment reward units
     :param progress: counts episodes
     """
     wrap = agent.wrapper or functools.partial(ReturnToGoWrapper, target_return=targets[0])
@@ -178,7 +180,7 @@ def sweep(
             progress.update(before + n_done - progress.n)
 
         episodes = evaluate(model, vec_env, range(first, first + options.episodes), count)
-        reached.append(Asked(target, episodes.returns, episodes.successes))
+        reached.append(Reached(target, episodes.returns, episodes.successes))
     vec_env.close()
     return reached
 
@@ -202,50 +204,50 @@ def first_state(options: argparse.Namespace) -> int:
     return FIRST_STATE + SEED_STRIDE * options.seed
 
 
-def table(curves: dict[str, list[Asked]]) -> list[str]:
+def table(curves: dict[str, list[Reached]]) -> list[str]:
     """
     :param curves: what each model reached, by its name
     :return: lines of Markdown: mean return and its 95 % interval, and how many episodes solved the task if it reports that
     """
-    lines = [f"| asked | {' | '.join(curves)} |", f"| --- |{' --- |' * len(curves)}"]
+    lines = [f"| target return | {' | '.join(curves)} |", f"| --- |{' --- |' * len(curves)}"]
     for row in zip(*curves.values(), strict=True):
         lines.append(f"| {row[0].target:,.6g} | {' | '.join(map(_summary, row))} |")
     return lines
 
 
-def _summary(asked: Asked) -> str:
-    estimate, low, high = asked.interval
+def _summary(reached: Reached) -> str:
+    estimate, low, high = reached.interval
     limits = "" if np.isnan(low) else f" [{low:,.6g}, {high:,.6g}]"
-    solved = "" if asked.successes is None else f", {sum(asked.successes)} of {len(asked.successes)} solved"
+    solved = "" if reached.successes is None else f", {sum(reached.successes)} of {len(reached.successes)} solved"
     return f"{estimate:,.6g}{limits}{solved}"
 
 
-def finding(reached: Sequence[Asked]) -> str:
+def finding(reached: Sequence[Reached]) -> str:
     """
-    Whether it matters what a model is asked for, and what to ask for.
+    Whether the target return has an effect, and the best one.
 
     :param reached: for each of two or more returns, as many episodes
     :return: a sentence
     """
-    returns = np.array([asked.returns for asked in reached])
+    returns = np.array([each.returns for each in reached])
     n_episodes, means = returns.shape[1], returns.mean(axis=1)
     if chance(returns) < SIGNIFICANT:
-        best = max(reached, key=lambda asked: (sum(asked.successes or []), np.mean(asked.returns)))
+        best = max(reached, key=lambda each: (sum(each.successes or []), np.mean(each.returns)))
         solved = "" if best.successes is None else f" and solved {sum(best.successes)} of {n_episodes}"
-        return f"Asked for {best.target:g} it did best: it returned {np.mean(best.returns):,.6g} on average{solved}."
+        return f"The best target return is {best.target:g}: it returned {np.mean(best.returns):,.6g} on average{solved}."
     span = f"{reached[0].target:,.6g} to {reached[-1].target:,.6g}"
     if n_episodes < FEWEST_EPISODES or np.ptp(means) > np.sqrt(returns.var(axis=1, ddof=1).mean()):
         more = max(4 * n_episodes, 20)
-        return f"It takes more episodes to tell whether asking for {span} changes the return: --episodes {more}."
-    unchanged = f"Asking for {span} changes the return by less than its spread between episodes"
-    return f"{unchanged}: this model copies the data whatever it is asked for."
+        return f"It takes more episodes to tell whether a target return of {span} changes the return: --episodes {more}."
+    unchanged = f"A target return of {span} changes the return by less than its spread between episodes"
+    return f"{unchanged}: this model copies the data whatever its target return."
 
 
 def chance(returns: np.ndarray) -> float:
     """
     A permutation test of the means against the spread between episodes, be it by their initial states or not.
 
-    :param returns: (R, E) for each of R returns asked for, of E episodes
+    :param returns: (R, E) for each of R target returns, of E episodes
     :return: share of the ways to shuffle all returns by which the R means differ at least as much, in (0, 1]
     """
     rng = np.random.default_rng(0)
@@ -254,7 +256,7 @@ def chance(returns: np.ndarray) -> float:
     return (1 + np.count_nonzero(as_much)) / (1 + N_SHUFFLES)
 
 
-def draw(curves: dict[str, list[Asked]], recorded: np.ndarray, output: Path, title: str) -> Path:
+def draw(curves: dict[str, list[Reached]], recorded: np.ndarray, output: Path, title: str) -> Path:
     """
     Draw reached returns over target returns, above the returns of the recorded episodes.
 
@@ -268,10 +270,10 @@ def draw(curves: dict[str, list[Asked]], recorded: np.ndarray, output: Path, tit
 
     figure = Figure(figsize=(6.4, 5.4), layout="constrained")
     axis, below = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
-    targets = np.array([asked.target for asked in next(iter(curves.values()))])
+    targets = np.array([each.target for each in next(iter(curves.values()))])
     axis.plot(targets, targets, color="0.6", linestyle="--", linewidth=1.2, label="target return")
     for (name, reached), color in zip(curves.items(), COLORS * len(curves), strict=False):
-        estimate, low, high = np.array([asked.interval for asked in reached]).T
+        estimate, low, high = np.array([each.interval for each in reached]).T
         axis.plot(targets, estimate, color=color, marker="o", markersize=4, linewidth=1.8, label=name)
         axis.fill_between(targets, low, high, color=color, alpha=0.15, linewidth=0)
     axis.set(ylabel="return reached", title=title)

@@ -1,4 +1,4 @@
-"""What Parquet and Arrow files are read with, when there are any: pyarrow is as large as all else here but PyTorch."""
+"""Reads Parquet and Arrow files, when there are any: pyarrow is as large as all else here but PyTorch."""
 
 from types import ModuleType
 from typing import Any

@@ -52,7 +52,7 @@ class TrajectoryBuffer(FlatSteps):
     :ivar image_spaces: of the images, uint8 as they were recorded, by camera; the images themselves are `own(camera)`
     :ivar episodes: the buffer's episodes, one row each
     :ivar weights: (E,) float64, how often a step of each is drawn beside one of weight 1
-    :ivar env_id: Gymnasium id of the environment that they come from, None where nobody says
+    :ivar env_id: Gymnasium id of the environment that they come from, None if unknown
     :ivar dropped: how many episodes `on_invalid="drop"` has left out, and why the first of them; None where it had none
     :ivar device: what batches are made for
     """
@@ -161,7 +161,7 @@ class TrajectoryBuffer(FlatSteps):
         return self.episodes.successes
 
     def statistics(self) -> Statistics:
-        """What inputs are normalised by, over the buffer's own steps; reads none of them."""
+        """Normalisation statistics of the buffer's own steps; reads none of them."""
         return self.episodes.statistics()
 
     def return_to_go_range(self) -> th.Tensor:
@@ -228,8 +228,8 @@ class TrajectoryBuffer(FlatSteps):
             return self
         warnings.warn(
             f"{self.source}: {len(longer)} of {self.n_episodes} episodes have more than {max_episode_steps} steps, up to "
-            f"{self.episode_lengths.max()}. What came later is left out, rewards too. An environment with a larger "
-            "max_episode_steps shows it; dataset_kwargs={'max_episode_steps': None} learns from it all the same.",
+            f"{self.episode_lengths.max()}. Later steps and their rewards are left out. To keep them, make an environment "
+            "with a larger max_episode_steps, or set dataset_kwargs={'max_episode_steps': None}.",
             stacklevel=2,
         )
         table = EpisodeTable(*(column.copy() for column in self.episodes))

@@ -82,7 +82,7 @@ def files_below(folder: Path, part: str = "") -> list[Path]:
 
 class Fingerprint(NamedTuple):
     """
-    What a cache was made from.
+    Origin of a cache.
 
     :param name: what the dataset is called
     :param path: its file or folder

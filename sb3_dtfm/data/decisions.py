@@ -129,13 +129,12 @@ def _by_return(errors: PredictionErrors | None) -> list[Decision]:
 
 def _by_reward(buffer: TrajectoryBuffer) -> list[Decision]:
     """
-    Whether it counts which returns may be expected from an observation, instead of what was recorded and is asked for.
+    Whether returns to go are those to be expected from an observation, instead of the recorded ones.
 
     With returns expected after 50 steps three mediocre cheetahs with noise return 4,760 and 4,383 (two seeds) instead of
-    4,237, both at the target's pace. Where a reward only tells of success, success may be expected from everywhere: a maze
-    of random walks is solved in 1 % instead of 27 %. Nor may failure be: of cans of which every second one is dropped, a
-    policy that asks for no more than what followed from there puts away 70 %, one that always asks for success 96 %; the
-    maze is solved in 27 and 44 %.
+    4,237, both with a bounded return-to-go. Where a reward only tells of success, success may be expected from everywhere: a
+    maze of random walks is solved in 1 % instead of 27 %. Nor may failure be: of cans of which every second one is dropped,
+    a policy with `return_range` puts away 70 %, without it 96 %; the maze is solved in 27 and 44 %.
     """
     rewards = buffer.rewards
     n_equal = int((rewards == rewards.mode().values).sum())
@@ -151,7 +150,7 @@ def _kind_of_actor(errors: PredictionErrors | None, correlation: float) -> list[
     """Settings that depend on whether previous action or observation predicts actions better."""
     ratio = None if errors is None else errors.plan_ratio()
     plans = ratio is not None and ratio > 1.0
-    # The trunk learns by the loss of what acts: the flow's, or the regression's.
+    # The Transformer learns by the loss of what acts: the flow's, or the regression's.
     flow = {"flow_steps": FLOW_STEPS if plans else 0, "regression_coef": 0.0 if plans else 1.0}
     # Scripts depend on the time step: it raised success on Lift from 34 to 46 %, ten demonstrations and batches of 256.
     settings = {"chunk_size": CHUNK_SIZE if plans else 1, **flow, "timestep_embedding": plans}

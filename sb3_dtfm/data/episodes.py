@@ -1,4 +1,4 @@
-"""What a buffer keeps of each episode besides its steps, and the statistics of any choice of episodes."""
+"""A buffer's table of episodes, and the statistics of any choice of episodes."""
 
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ SMALLEST_ROBUST_STD = 0.1
 
 class Statistics(NamedTuple):
     """
-    What inputs are normalised by.
+    Statistics that normalise inputs.
 
     Shapes: observation_mean (O,) and observation_std (O,) over all steps, float64; observation_robust_std
     (O,), the lower quartile of the episodes' standard deviations, see :meth:`EpisodeTable.statistics`;

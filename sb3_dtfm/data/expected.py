@@ -1,4 +1,4 @@
-"""What can be expected to follow observations, where an episode tells what followed once."""
+"""Expected returns after observations, where an episode tells one return only."""
 
 import math
 from typing import NamedTuple

@@ -427,15 +427,15 @@ def bounded_space(bounds: Sequence[Any] | None, space: ActionSpace | None, actio
     :param actions: as :func:`check_shape` lets them pass
     :param source: whose actions they are, for messages
     :return: where neither is given, from -1 to 1
-    :raises DatasetError: `bounds` are something else, or nobody says how many Discrete actions there are
+    :raises DatasetError: `bounds` are something else, or the number of Discrete actions is unknown
     """
     if bounds is None and space is not None and (isinstance(space, spaces.Discrete) or space.shape == actions.shape[1:]):
         return space
     n_actions = actions.shape[1:]
     if not n_actions and bounds is None:
         raise DatasetError(
-            f"{source}: actions are whole numbers, one a step, and nobody says how many there are: give an environment with "
-            "a Discrete action space, or action_bounds=(first, last)."
+            f"{source}: actions are whole numbers, one a step; expected their number, too: give an environment with a "
+            "Discrete action space, or action_bounds=(first, last)."
         )
     try:
         if not n_actions:
@@ -453,7 +453,7 @@ def bounded_space(bounds: Sequence[Any] | None, space: ActionSpace | None, actio
 @contextlib.contextmanager
 def explain_range(space: ActionSpace, bounds: Sequence[Any] | None, environment: ActionSpace | None) -> Iterator[None]:
     """
-    Where nobody has said which range actions have, say how to tell.
+    Explain the default range of actions, and how to give another.
 
     :param space: what the actions are learned as
     :param bounds: that have been given, or None
@@ -466,7 +466,7 @@ def explain_range(space: ActionSpace, bounds: Sequence[Any] | None, environment:
         if bounds is not None or space is environment:
             raise
         raise ActionRangeError(
-            f"{error} This range is assumed, since nobody tells of another. Give an environment (inspect: --env ID), or "
+            f"{error} This range is the default. Give an environment (inspect: --env ID), or "
             "action_bounds=(smallest, largest), or clip_actions=True."
         ) from error
 

@@ -1,4 +1,4 @@
-"""What is in a buffer, and what a user should know of it before training."""
+"""Content of a buffer, and possible faults of it before training."""
 
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ AT_BOUND, MANY = 1e-3, 0.5
 # Standard deviations from the mean at which a number is no measurement any more.
 FAR = 100.0
 FEW_EPISODES = 20
-# Whose mean return is to be asked for.
+# Their mean return is the suggested target return.
 BEST_SHARE = 0.1
 # Returns tell the start rather than the quality where the first observation explains this share of their variance.
 START_DECIDES = 0.5
@@ -39,7 +39,7 @@ class Range(NamedTuple):
 
 class Inspection(NamedTuple):
     """
-    What was found.
+    Findings.
 
     :param observations: of O dimensions
     :param actions: of A dimensions, in the environment's range; of a Discrete space's n actions, whose mean is a share
@@ -72,7 +72,7 @@ def inspect_buffer(buffer: TrajectoryBuffer) -> Inspection:
 
 def suggested_target_return(buffer: TrajectoryBuffer) -> float:
     """
-    A return to ask for: the mean of the best tenth of the episodes; of all episodes where the start decides their returns,
+    A target return: the mean of the best tenth of the episodes; of all episodes where the start decides their returns,
     since the best tenth had the easiest starts then.
 
     :param buffer: as it would be learned from
@@ -149,9 +149,9 @@ def _of_episodes(buffer: TrajectoryBuffer) -> list[str]:
     if buffer.n_dropped:
         remarks.append(f"Left out, since they cannot be used: {_count(buffer.n_dropped, 'episode')}.")
     if not returns.any():
-        remarks.append("No episode has any return, so that asking for one says nothing.")
+        remarks.append("No episode has any return, so a target return has no effect.")
     elif np.ptp(returns) == 0:
-        remarks.append(f"All returns are {returns[0]:g}: the policy copies what it sees, whatever it is asked for.")
+        remarks.append(f"All returns are {returns[0]:g}: the policy copies what it sees, whatever its target return.")
     explained = explained_by_start(buffer)
     if explained >= START_DECIDES:
         start = f"Returns depend on how an episode starts ({100 * explained:.0f} % of their variance)"

@@ -69,7 +69,7 @@ def is_images(array: Any) -> bool:
 
 def as_vectors(observations: Any, where: str) -> np.ndarray:
     """
-    Observations of which nobody has told the space.
+    Observations of an unknown space.
 
     :param observations: (T, ...), or a dictionary of such, of any depth
     :param where: whose they are, for messages

@@ -1,4 +1,4 @@
-"""Where the flat arrays of a buffer's steps go while episodes are read: memory, or files that are then memory-mapped."""
+"""Storage of the flat arrays of a buffer's steps while episodes are read: memory, or files that are then memory-mapped."""
 
 import concurrent.futures
 import contextlib

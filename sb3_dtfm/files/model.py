@@ -25,7 +25,7 @@ from sb3_dtfm.files.replacing import replacing
 FORMAT = 1
 CONFIGURATION = "model.json"
 SYSTEM_INFO = "system_info.txt"
-# What other tools look for in a model of Stable-Baselines3.
+# Entries that other tools read in a model of Stable-Baselines3.
 SB3_VERSION = "_stable_baselines3_version"
 TENSORS_SUFFIX = ".safetensors"
 # Members of a file that Stable-Baselines3 itself, or an earlier version of this package, has written.
@@ -49,7 +49,7 @@ class ModelFileError(ValueError):
 
 class ModelFile(NamedTuple):
     """
-    What a file holds.
+    Content of a file.
 
     :param configuration: JSON's values, without what is only about the file itself
     :param tensors: by group, for example "policy", and name
@@ -80,7 +80,7 @@ def write_model(path: Any, model: ModelFile) -> None:
 
 
 def _with_suffix(path: Path) -> Path:
-    """Where SB3 saves a model: with `.zip` behind a name that has no suffix."""
+    """Path at which SB3 saves a model: with `.zip` behind a name that has no suffix."""
     return path if path.suffix else path.with_name(f"{path.name}.zip")
 
 
@@ -107,7 +107,7 @@ def read_model(path: Any, groups: Set[str], device: th.device, print_system_info
 
 def read_configuration(path: Any) -> dict[str, Any]:
     """
-    What a file says of its model, without the tensors.
+    A file's description of its model, without the tensors.
 
     :param path: as for :func:`read_model`
     :raises FileNotFoundError: no such file
@@ -139,7 +139,7 @@ def _archive(file: BinaryIO, name: str) -> Iterator[zipfile.ZipFile]:
 
 
 def file_name(path: Any) -> str:
-    """What to call a path, or a file object, in messages."""
+    """Name of a path, or of a file object, for messages."""
     return str(getattr(path, "name", "the file object")) if hasattr(path, "read") else str(path)
 
 
@@ -191,7 +191,7 @@ class _Reader:
         pickled = [name for name in self.infos if name.endswith(PICKLED)]
         if pickled:
             self.fail(
-                f"{', '.join(pickled)}: pickled, and loading would run what they hold. Of a file that you trust, "
+                f"{', '.join(pickled)}: pickled, so loading could run code. If you trust the file, "
                 "load(path, allow_pickle=True).save(path) makes one without."
             )
         if CONFIGURATION not in self.infos:
@@ -214,7 +214,7 @@ class _Reader:
         self.fail(f"{CONFIGURATION} holds {text}; numbers must be finite.")
 
     def _members(self, configuration: dict[str, Any], expected: Set[str]) -> dict[str, dict[str, Any]]:
-        """What the file says about its tensors."""
+        """The file's description of its tensors."""
         about = configuration.pop("members", None)
         if not isinstance(about, dict) or about.keys() != expected or not all(isinstance(x, dict) for x in about.values()):
             self.fail(f"{CONFIGURATION} does not describe the members {', '.join(sorted(expected))}.")

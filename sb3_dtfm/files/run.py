@@ -1,4 +1,4 @@
-"""What an RL-Zoo run tells of the environment that its model was trained in, read as data."""
+"""The environment of an RL-Zoo run's training, read as data."""
 
 import ast
 import contextlib

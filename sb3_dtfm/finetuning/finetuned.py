@@ -23,7 +23,7 @@ from sb3_dtfm.finetuning.online_actor import (
 from sb3_dtfm.finetuning.residual_env import ResidualActionVecEnv
 from sb3_dtfm.policies import DTFMPolicy, SequencePolicy
 
-# What commands and folders of runs call it.
+# Its name in commands and folders of runs.
 FINETUNED = "finetuned"
 # Classes whose actors can be taken over, by whether they squash their actions by tanh; sb3-contrib is an extra.
 SQUASHED = {"SAC": True, "TQC": True, "PPO": False, "A2C": False, "TRPO": False}

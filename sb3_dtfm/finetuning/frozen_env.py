@@ -1,4 +1,4 @@
-"""What an online algorithm sees where a frozen policy acts, whatever the algorithm chooses of how it acts."""
+"""Environments of online algorithms that choose how a frozen policy acts."""
 
 from os import PathLike
 
@@ -21,10 +21,10 @@ from sb3_dtfm.windows import Windows
 
 class FrozenPolicyVecEnv(VecEnvWrapper):
     """
-    One step is one decision of a frozen DTFM, of which somebody else chooses something.
+    One step is one decision of a frozen DTFM, of which an online algorithm chooses a part.
 
-    What is observed is one vector, in the units of the model's training data and clipped at 10: the environment's
-    observation, the return-to-go as the trunk gets it and the time step; with `hidden_state` also the trunk's hidden state,
+    The observation is one vector, in the units of the model's training data and clipped at 10: the environment's
+    observation, the return-to-go as the Transformer gets it and the time step; with `hidden_state` also its hidden state,
     which has seen the steps before.
 
     The model is left as it is: its weights, the context that its own `predict` remembers, and its random numbers.
@@ -32,7 +32,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
     :param venv: environments wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
     :param model: a DTFM, or the path to a saved one
     :param bound: how far the choice may go
-    :param hidden_state: show the trunk's hidden state as well
+    :param hidden_state: show the Transformer's hidden state as well
     :raises ValueError: a model that has an online actor already or does not fit, environments that do not fit, or an
         argument out of range
     """
@@ -65,7 +65,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
     @staticmethod
     def _action_space(policy: SequencePolicy, bound: float) -> spaces.Box:
         """
-        What may be chosen.
+        Space of choices.
 
         :raises ValueError: a policy of which nothing can be chosen
         """
@@ -78,7 +78,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
 
     def _act(self, context: Context, hidden: th.Tensor, actions: np.ndarray) -> tuple[np.ndarray, Context]:
         """
-        What comes of a choice.
+        Actions that follow from a choice.
 
         :param actions: (B, ...), of the action space
         :return: actions (B, n_action_steps, A) in the environment's range, and the context with them

@@ -40,17 +40,17 @@ class NoiseSpace(spaces.Box):
 
 class NoiseActionVecEnv(FrozenPolicyVecEnv):
     """
-    Acts with a frozen DTFM from noise that somebody else chooses: `SAC("MlpPolicy", NoiseActionVecEnv(venv, model))`.
+    Acts with a frozen DTFM from noise that an online algorithm chooses: `SAC("MlpPolicy", NoiseActionVecEnv(venv, model))`.
 
     One step is one decision of the frozen policy: with `chunk_size` it carries out `n_action_steps` actions, and rewards
     are added up, without a discount, so that the return of an episode stays what it is. A discount factor counts decisions.
 
-    What is observed, and what happens to the model, see :class:`~sb3_dtfm.finetuning.frozen_env.FrozenPolicyVecEnv`.
+    For observations, and for the model, see :class:`~sb3_dtfm.finetuning.frozen_env.FrozenPolicyVecEnv`.
 
     :param venv: environments wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
     :param model: a DTFM, or the path to a saved one
     :param bound: largest absolute noise
-    :param hidden_state: show the trunk's hidden state as well
+    :param hidden_state: show the Transformer's hidden state as well
     :raises ValueError: a policy whose actions do not depend on noise (DT, and one step of Euler, which ends at the mean
         action), environments that do not fit it, or an argument out of range
     """

@@ -40,8 +40,8 @@ def actor_observation(normalization: Normalization, newest: Windows, hidden: th.
 
     :param normalization: of the policy
     :param newest: (B, 1, ...), in the environment's units
-    :param hidden: (B, D) of the trunk; None leaves it out
-    :return: (B, O + 2), or (B, O + 2 + D), each within `OBSERVATION_CLIP`: observation, return-to-go as the trunk gets it,
+    :param hidden: (B, D) of the Transformer; None leaves it out
+    :return: (B, O + 2), or (B, O + 2 + D), each within `OBSERVATION_CLIP`: observation, the Transformer's return-to-go,
         time step as a share of the longest episode that was learned from
     """
     scaled = normalization(newest)
@@ -64,7 +64,7 @@ class OnlineActor(nn.Module):
     :param activation: a key of `ACTIVATIONS`
     :param squashed: it chooses bound * tanh(...), as SAC's and TQC's actions; otherwise clipped to the bound, as PPO's
     :param bound: largest absolute noise, or residual action in units of [-1, 1]
-    :param hidden_state: the trunk's hidden state is part of what it sees
+    :param hidden_state: the Transformer's hidden state is part of what it sees
     :param residual: it adds residual actions, and sees the policy's own behind the rest; otherwise it chooses noise
     :raises ValueError: an argument out of range, by name
     """
@@ -119,7 +119,7 @@ class OnlineActor(nn.Module):
 
         :param normalization: of the policy
         :param newest: (B, 1, ...), in the environment's units
-        :param hidden: (B, D) of the trunk
+        :param hidden: (B, D) of the Transformer
         :param drawn: noise (B, N), standard normal
         :param decode: from noise to actions (B, H A) in [-1, 1]
         :return: (B, H A) in [-1, 1]
@@ -138,7 +138,7 @@ def make_online_actor(
 ) -> OnlineActor:
     """
     :param observation_dim: O, of the environment
-    :param embed_dim: D, of the trunk
+    :param embed_dim: D, of the Transformer
     :param noise_dim: N, of the head
     :param action_dim: A
     :param settings: the keyword arguments of :class:`OnlineActor`
@@ -158,7 +158,7 @@ def make_online_actor(
 
 def check_noise_actions(policy: SequencePolicy) -> int:
     """
-    :return: N, numbers of the noise that somebody else may choose
+    :return: N, numbers of the noise that an online algorithm chooses
     :raises ValueError: there is no flow
     """
     head = policy.network.head

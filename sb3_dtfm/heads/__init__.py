@@ -1,5 +1,5 @@
 """
-Action heads: from the trunk's hidden state to actions. One file a head.
+Action heads: from the Transformer's hidden state to actions. One file a head.
 
 Each file says all of its head: options, noise, loss, actions, ways of acting, search space.
 """

@@ -1,4 +1,4 @@
-"""What the policy, the algorithm, RL-Zoo and the benchmark ask of a head."""
+"""Interface of a head for the policy, the algorithm, RL-Zoo and the benchmark."""
 
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
@@ -21,7 +21,7 @@ class ActionHead(nn.Module, ABC):
     :param options: of `options_class`, by name: users give them among `policy_kwargs`
     :raises ValueError: an option out of range, by name
 
-    :cvar algorithm: name of the algorithm that trunk and head make together, for example "DTFM"
+    :cvar algorithm: name of the algorithm that Transformer and head make together, for example "DTFM"
     :cvar discrete: the head for Discrete action spaces, with this head's options; None refuses them
     :cvar options_class: the head's options
     :ivar options: how the head was made and acts; :meth:`Options.changed` gives other ways of acting
@@ -45,7 +45,7 @@ class ActionHead(nn.Module, ABC):
 
     def deterministic_noise(self, generator: th.Generator) -> th.Tensor:
         """
-        What deterministic acting starts from, saved with the weights: rows that it takes one after the other.
+        Noise table of deterministic acting, saved with the weights: rows that it takes one after the other.
 
         :param generator: for what is drawn
         :return: (R, noise_dim)
@@ -54,7 +54,7 @@ class ActionHead(nn.Module, ABC):
 
     def draw_noise(self, actions: th.Tensor, generator: th.Generator) -> tuple[th.Tensor, ...]:
         """
-        What the loss draws at random, drawn apart from it, so that the loss is a plain function.
+        Random numbers of the loss, drawn apart from it, so that the loss is a plain function.
 
         :param actions: (B, K, A), of the batch
         :param generator: on the device of `actions`

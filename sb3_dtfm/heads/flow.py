@@ -90,14 +90,13 @@ class FlowHead(ActionHead):
     prediction is tanh(W h + b + FiLM network), whose last term starts at zero: training starts from Decision Transformer's
     regression, and what noise and time have to add to it is learned.
 
-    With `regression_coef` above 0, trunk and W h + b learn by Decision Transformer's loss, and the FiLM network by flow
+    With `regression_coef` above 0, Transformer and W h + b learn by the regression's loss, and the FiLM network by flow
     matching from a hidden state that it gives no gradient. `flow_steps=0` then acts with tanh(W h + b), the mean action.
-    By the flow's loss alone the trunk learns the mean more slowly.
+    By the flow's loss alone the Transformer learns the mean more slowly.
 
     With `one_step_policy` a second network learns where `flow_steps` of Euler end, 16 at most, so that an action can take
-    one evaluation instead of one per solver step. It learns from the field and passes no gradient back: trunk and field
-    are the same without it. Where the field predicts actions, this network adds to the same W h + b, and starts at zero
-    too; else it adds to the noise.
+    one evaluation instead of one per solver step. It passes no gradient back. Where the field predicts actions, it adds
+    to the same W h + b, and starts at zero, too; else it adds to the noise.
 
     :param embed_dim: D
     :param action_dim: A
@@ -161,7 +160,7 @@ class FlowHead(ActionHead):
         """
         Conditional flow matching (Lipman et al., 2023): squared error on the path from noise to action.
 
-        Of the velocity, or of the action, which weighs the velocity's by (1 - tau)^2.
+        The error is the velocity's, or the action's, which weighs the velocity's by (1 - tau)^2.
 
         :param hidden: (B, K, D)
         :param actions: (B, K, A) in [-1, 1]

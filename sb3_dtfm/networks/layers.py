@@ -1,5 +1,5 @@
 """
-Layers that trunk and heads are made of: linear maps, dropout, sinusoidal embeddings, and MLPs that are scaled and shifted
+Layers of Transformer and heads: linear maps, dropout, sinusoidal embeddings, and MLPs that are scaled and shifted
 from outside (FiLM).
 
 Products of few rows and dropout masks have their own way on a CPU, with equal numbers. On 2 cores of an AMD EPYC with AVX2 a
@@ -185,12 +185,12 @@ class VectorField(FilmNetwork):
 
 class ReturnFilm(nn.Module):
     """
-    From a return-to-go to scales and shifts for all blocks of a trunk: an MLP of its sines and cosines.
+    From a return-to-go to scales and shifts for all blocks of the Transformer: an MLP of its sines and cosines.
 
     Scales start apart (standard deviation 0.2 of the last weights), so that returns that differ by a tenth are told apart
     from the first gradient step on.
 
-    :param embed_dim: width D of the trunk, and of the hidden layer
+    :param embed_dim: width D of the Transformer, and of the hidden layer
     :param n_blocks: number of its blocks
     """
 

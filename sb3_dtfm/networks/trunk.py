@@ -86,7 +86,7 @@ def attention(query: th.Tensor, key: th.Tensor, value: th.Tensor, bias: th.Tenso
 
 class SequenceTrunk(nn.Module):
     """
-    Decision Transformer trunk (Chen et al., 2021): a window of steps in, one hidden state per step out.
+    Transformer of DT and DTFM (Chen et al., 2021): a window of steps in, one hidden state per step out, for a head.
 
     Return-to-go, observation and action are embedded by a linear map each, plus a learned embedding of the absolute time
     step. They make three tokens, or one, the sum of a step's return-to-go, its observation and the action before it: a

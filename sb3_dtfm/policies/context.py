@@ -13,7 +13,7 @@ import numpy as np
 
 from sb3_dtfm.windows import Windows
 
-# What an observation holds beside the numbers of the environment.
+# Keys of an observation beside those of the environment.
 COLUMNS = {"return_to_go": np.float32, "timestep": np.int64}
 OBSERVATION_KEYS = ("observation", *COLUMNS)
 # The largest time step, as in the wrapper's space.

@@ -16,7 +16,7 @@ from sb3_dtfm.transitions import Transitions
 # Kostrikov et al. (2022): how fast the network that backups look at follows, and the rate at which all learn.
 TARGET_SHARE = 0.005
 LEARNING_RATE = 3e-4
-# What the largest discounted return-to-go becomes.
+# Value of the largest discounted return-to-go after scaling.
 LARGEST_VALUE = 10.0
 # How far apart in the noise table the samples' rows lie, and those that chance chooses by: no divisors of its length.
 SAMPLE_STRIDE, CHOICE_STRIDE, CHOICE_START = 97, 31, 513
@@ -26,8 +26,8 @@ STD_SHARE = 0.01
 
 class Critic(nn.Module):
     """
-    Implicit Q-learning (Kostrikov et al., 2022): values of observations and actions, without asking about an action that
-    nobody took.
+    Implicit Q-learning (Kostrikov et al., 2022): values of observations and actions, without a value of any action that
+    was not recorded.
 
     V(s) is an expectile of Q(s, a) over the data's actions, above their mean: what a good one of them leads to. Q(s, a) is
     the reward and the discounted V of the next observation. Of two Qs the smaller one counts.
@@ -121,7 +121,7 @@ class Critic(nn.Module):
         self.optimizer.found_inf = (~finite).float()  # type: ignore[attr-defined]
         self.optimizer.step()
         self.advantage_std.lerp_(th.where(finite, parts["advantage_std"], self.advantage_std), STD_SHARE)
-        # What backups look at moves towards what learns.
+        # The target network moves towards the learning one.
         followers = [parameter.data for parameter in self.q_target.parameters()]
         th._foreach_lerp_(followers, [parameter.data for parameter in self.q.parameters()], TARGET_SHARE)
         return parts
@@ -172,7 +172,7 @@ class Critic(nn.Module):
 
 
 def _mlp(input_dim: int, hidden_dim: int) -> nn.Sequential:
-    """Layer norms keep the values of actions that nobody took near those of others (Ball et al., 2023)."""
+    """Layer norms keep the values of actions that were not recorded near those of others (Ball et al., 2023)."""
     sizes = (input_dim, hidden_dim, hidden_dim)
     hidden = [layer for i in (0, 1) for layer in (nn.Linear(sizes[i], sizes[i + 1]), nn.LayerNorm(sizes[i + 1]), nn.ReLU())]
     return nn.Sequential(*hidden, nn.Linear(hidden_dim, 1))

@@ -1,4 +1,4 @@
-"""What a policy remembers between calls of `predict` that pass no `state`."""
+"""Memory of a policy between calls of `predict` that pass no `state`."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Everything that is trained: trunk, head, and the expected range of returns-to-go."""
+"""Everything that is trained: Transformer, head, and the expected range of returns-to-go."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ EXPECTILES = (0.05, 0.95)
 
 class ReturnRange(nn.Module):
     """
-    A lower and an upper expectile of the return-to-go by the observation (Newey and Powell, 1987), in the trunk's units.
+    A lower and an upper expectile of the normalised return-to-go by the observation (Newey and Powell, 1987).
 
     Returns-to-go outside of it are rare in the training data from such an observation. This matters where the start decides
     the return, as in Pendulum, and where an agent has fallen and cannot reach the target any more.
@@ -37,7 +37,7 @@ class ReturnRange(nn.Module):
     def loss(self, observations: th.Tensor, returns_to_go: th.Tensor, mask: th.Tensor) -> th.Tensor:
         """
         :param observations: (B, K, O), normalised
-        :param returns_to_go: (B, K), in the trunk's units
+        :param returns_to_go: (B, K), normalised
         :param mask: (B, K) bool, False on padded steps
         :return: sum of both expectile losses, mean over valid steps
         """

@@ -25,7 +25,7 @@ SMALLEST_STD = 1e-5
 
 class Normalization(nn.Module):
     """
-    What inputs are normalised by, measured on the training data and saved with the weights; and the range of actions.
+    Statistics that normalise inputs, measured on the training data and saved with the weights; and the range of actions.
 
     :param observation_dim: O, or O + F with the features of images behind, which stay as they are
     :param action_space: bounded Box (A,)

@@ -64,7 +64,7 @@ class PolicyOptions(Options):
     :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step. Asking for more than
         any episode reached, or falling behind, then stays an input like those the policy learned from
     :param return_scaling: "timestep" or "max", see :class:`~sb3_dtfm.policies.normalization.Normalization`
-    :param film_return_to_go: let the return-to-go scale and shift what each block of the trunk gets, besides being a token
+    :param film_return_to_go: let the return-to-go scale and shift the input of each Transformer block, besides being a token
     :param observation_scaling: "std" divides observations by their standard deviation, "robust" by the lower quartile of
         the episodes' standard deviations, for data in which some agents' observations vary far more; see
         :meth:`EpisodeTable.statistics`
@@ -73,11 +73,11 @@ class PolicyOptions(Options):
     :param features_extractor_kwargs: of that class, for example `features_dim`
     :param normalize_images: divide images by 255, as SB3 does
     :param share_features_extractor: one extractor for all cameras instead of one each
-    :param timestep_embedding: tell the trunk the absolute time step, as Decision Transformer does
+    :param timestep_embedding: tell the Transformer the absolute time step, as Decision Transformer does
     :param tokens_per_step: 3, return-to-go, observation and action, as Decision Transformer does; or 1, the sum of a step's
         return-to-go, its observation and the action before it: a third of the multiply-accumulates
     :param critic_steps: with each gradient step, how many a critic takes, which learns what actions are worth so that the
-        best of several can be taken, see :class:`~sb3_dtfm.policies.critic.Critic`; trunk and head learn as without. It
+        best of several can be taken, see :class:`~sb3_dtfm.policies.critic.Critic`; the policy learns as without. It
         needs a head that draws; 0 for no critic
     :param gamma: discount of a step for the critic
     :param expectile: of the critic's value loss, in [0.5, 1)

@@ -42,7 +42,7 @@ from sb3_dtfm.windows import OBSERVATION, Windows, map_tensors
 
 class SequencePolicy(BasePolicy):
     """
-    A policy over the last `context_length` steps: the trunk's hidden state, and a head that makes an action of it.
+    A policy over the last `context_length` steps: the Transformer's hidden state, and a head that makes an action of it.
 
     `deterministic=True` starts from noise that belongs to the time step and the episode: rows of a table that is drawn once
     from `seed` and saved with the model, from a row on that the episode's first observation decides. Zero noise would be one
@@ -161,7 +161,7 @@ class SequencePolicy(BasePolicy):
 
     @classmethod
     def parameter_names(cls) -> set[str]:
-        """What `policy_kwargs` may hold: options of the policy and of its head."""
+        """Keys of `policy_kwargs`: options of the policy and of its head."""
         return set(PolicyOptions.defaults()) | set(cls.head_class.options_class.defaults())
 
     @classmethod
@@ -284,7 +284,7 @@ class SequencePolicy(BasePolicy):
         enough: a row starts anew where its time step is not the last one plus one, and is asked again where both time step
         and observation are the last ones. :meth:`reset` forgets it.
 
-        Actions are finite and inside the action space. What cannot be acted on is an error before anything has changed: the
+        Actions are finite and inside the action space. Invalid input is an error before anything has changed: the
         caller mends the row that it names, or begins it anew, and asks again; the other rows go on as if nothing had been.
 
         :param observation: Dict of `observation` (O,), `return_to_go` (1,), `timestep` (1,), or with a leading axis B, and
@@ -354,7 +354,7 @@ class SequencePolicy(BasePolicy):
         :param observation: as for :meth:`predict`
         :param state: what :meth:`decode` or :meth:`predict` returned; None for no past
         :param episode_start: (B,) bool, True where an environment was just reset
-        :return: the context with the newest step, and the trunk's hidden states (B, D)
+        :return: the context with the newest step, and the Transformer's hidden states (B, D)
         :raises ValueError: as :meth:`predict`
         """
         arrays, frames, _ = self._unpack(observation)
@@ -395,7 +395,7 @@ class SequencePolicy(BasePolicy):
 
     def apply_actions(self, context: Context, chunks: np.ndarray) -> tuple[np.ndarray, Context]:
         """
-        What comes of actions that somebody else has chosen.
+        Carry out actions that an online algorithm has chosen.
 
         :param context: what :meth:`encode` returned
         :param chunks: (B, h, A) in [-1, 1], for at least the `n_action_steps` that are carried out

@@ -129,7 +129,7 @@ def record_agent(
 
 
 def episode_seeds(seed: int, n_episodes: int) -> list[int]:
-    """What the environments are reset with, (n_episodes,)."""
+    """Seeds of the environments, (n_episodes,)."""
     return [int(number) for number in np.random.default_rng(seed).integers(2**31, size=n_episodes)]
 
 

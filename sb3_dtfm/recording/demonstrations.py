@@ -32,7 +32,7 @@ def demonstrated_tasks() -> dict[str, tuple[str, type[Demonstrator]]]:
 
 class RecordingSummary(NamedTuple):
     """
-    What a recording has come to.
+    Result of a recording.
 
     :param path: the file
     :param n_episodes: successful episodes recorded

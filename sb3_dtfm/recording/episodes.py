@@ -45,7 +45,7 @@ class RecordedEpisode:
 
     @property
     def success(self) -> bool | None:
-        """What the environment said at the last step."""
+        """Info of the last step."""
         return self.reported[-1] if self.reported else None
 
 

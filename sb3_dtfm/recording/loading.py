@@ -32,7 +32,7 @@ ONNX = "onnx"
 @dataclass(frozen=True)
 class AgentFiles:
     """
-    Where an agent is, and what its environment was in training.
+    Path of an agent, and its environment in training.
 
     :param model: the agent's zip file
     :param env_kwargs: arguments of ``gymnasium.make``
@@ -228,7 +228,7 @@ def _check_not_normalized(model: BaseAlgorithm, path: Path) -> None:
 
     The agent's file holds its last observation, and the one before normalisation, which turns float64 into float32. Where
     the environment's are float32 already, having the latter means VecNormalize, except for off-policy algorithms, which
-    always have it: then nobody can tell, and there is a warning.
+    always have it: then this is unknown, and there is a warning.
     """
     seen, original = _dtypes(model._last_obs), _dtypes(model._last_original_obs)
     if not original or (seen == original and np.dtype(np.float32) not in seen):

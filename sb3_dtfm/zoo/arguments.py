@@ -1,4 +1,4 @@
-"""What `sb3-dtfm train` and `enjoy` add to RL-Zoo's own arguments, written in terms of those."""
+"""Arguments of `sb3-dtfm train` and `enjoy` beside RL-Zoo's own, written in terms of those."""
 
 import argparse
 from collections.abc import Callable, Sequence
@@ -34,7 +34,7 @@ class UsageError(ValueError):
     """Arguments that do not go together; the message says which would."""
 
 
-def asking_for(target_return: float | None, env_wrapper: Any) -> list[dict[Any, dict[str, Any]]]:
+def with_target_return(target_return: float | None, env_wrapper: Any) -> list[dict[Any, dict[str, Any]]]:
     """
     Wrappers of an environment with its target return.
 
@@ -50,17 +50,17 @@ def asking_for(target_return: float | None, env_wrapper: Any) -> list[dict[Any, 
     wrappers = _with_arguments(env_wrapper)
     if not any(_shows_return_to_go(wrapper) for wrapper, _ in wrappers):
         wrappers.append((WRAPPER, {}))
-    asking = []
+    with_target = []
     for wrapper, arguments in wrappers:
         if _shows_return_to_go(wrapper):
             arguments = {key: value for key, value in arguments.items() if key != "target_return"} | target
-        asking.append({wrapper: arguments})
-    return asking
+        with_target.append({wrapper: arguments})
+    return with_target
 
 
-def asked_for(env_wrapper: Any) -> float | None:
+def find_target_return(env_wrapper: Any) -> float | None:
     """
-    :param env_wrapper: as in :func:`asking_for`
+    :param env_wrapper: as in :func:`with_target_return`
     :return: the target return of its ReturnToGoWrapper, None where there is none
     """
     own = (arguments for wrapper, arguments in _with_arguments(env_wrapper) if _shows_return_to_go(wrapper))
@@ -134,7 +134,7 @@ class StoreLiterals(argparse.Action):
 
 class Restored(NamedTuple):
     """
-    What the user names beside `--resume RUN`, where all other arguments come from the run's folder.
+    Arguments beside `--resume RUN`, where all other arguments come from the run's folder.
 
     :param run: its folder
     :param packages: of `--gym-packages`
@@ -195,7 +195,7 @@ def train_parser() -> argparse.ArgumentParser:
     offline(
         "--target-return",
         type=float,
-        help="return to ask for when acting, in reward units; by default the settings' or, without one, the data decide",
+        help="in reward units; by default the settings' or, without one, the data decide",
     )
     offline(
         "-conf",
@@ -218,7 +218,7 @@ def train_parser() -> argparse.ArgumentParser:
 
 def restored_arguments(run: Path, others: Sequence[str]) -> Restored | None:
     """
-    What a user names beside `--resume`, whose packages are imported; None where there are other arguments.
+    Arguments beside `--resume`, whose packages are imported; None where there are other arguments.
 
     :param run: its folder
     :param others: the user's arguments beside `--resume`
@@ -349,7 +349,7 @@ def _shorthands(options: argparse.Namespace, settings: dict[str, Any]) -> list[t
     :param settings: of the task without these options
     :return: pairs of an option that was given and its `key:value`, whose value RL-Zoo evaluates as Python
     """
-    wrapper = asking_for(options.target_return, settings.get("env_wrapper") or [])
+    wrapper = with_target_return(options.target_return, settings.get("env_wrapper") or [])
     of_the_data = {"fraction": options.dataset_fraction, "cache_dir": options.dataset_cache}
     wanted = {name: value for name, value in of_the_data.items() if value is not None}
     kwargs = {**(settings.get("dataset_kwargs") or {}), **wanted}
@@ -373,7 +373,7 @@ def enjoy_parser() -> argparse.ArgumentParser:
         epilog="RL-Zoo's own options follow.\n",
     )
     offline = parser.add_argument_group(f"of {' and '.join(ALGORITHMS)}").add_argument
-    offline("--target-return", type=float, help="return to ask for, in reward units; the run's by default")
+    offline("--target-return", type=float, help="in reward units; the run's by default")
     shared = parser.add_argument_group("read on the way to RL-Zoo").add_argument
     shared("--algo", default="ppo", help=argparse.SUPPRESS)
     shared("-f", "--folder", help=argparse.SUPPRESS)
@@ -389,7 +389,7 @@ def enjoy_arguments(argv: Sequence[str]) -> tuple[float | None, list[str]]:
     Our models are looked for where `train` puts them, not among the Zoo's own agents.
 
     :param argv: the user's arguments
-    :raises UsageError: a target return for an algorithm that asks for none
+    :raises UsageError: a target return for an algorithm that has none
     """
     options, rest = enjoy_parser().parse_known_args(argv)
     check_algorithm(options.algo)
@@ -399,7 +399,7 @@ def enjoy_arguments(argv: Sequence[str]) -> tuple[float | None, list[str]]:
     if options.target_return is not None and not ours:
         raise UsageError(f"--target-return: for --algo {' and '.join(ALGORITHMS)} only, not for {options.algo}.")
     folder = options.folder or ("logs" if ours else None)
-    asking_for(options.target_return, None)  # refuses what is none
+    with_target_return(options.target_return, None)  # refuses what is none
     device = ["--device", options.device] if options.device else []
     arguments = ["--algo", options.algo, *rest, *device, *_packages(options), *(["--folder", folder] if folder else [])]
     return options.target_return, arguments

@@ -69,7 +69,7 @@ def finetune(
 
     :param arguments: of RL-Zoo's `train`
     :param model: zip file of the DTFM, or folder of its run
-    :param target_return: to ask for; None as in that run
+    :param target_return: environment reward units; None as in that run
     :param started_with: the command's own arguments
     :param resumed: folder of an interrupted run to go on with
     :param evaluations_of_a_run: between which a run's timesteps are divided; None where RL-Zoo's arguments say how often
@@ -97,7 +97,7 @@ def enjoy(arguments: Sequence[str], target_return: float | None = None) -> None:
     Act with a trained model, and compare its episodes with those that it learned from.
 
     :param arguments: of RL-Zoo's `enjoy`
-    :param target_return: to ask for, environment reward units; None as in the model's run
+    :param target_return: environment reward units; None as in the model's run
     :raises FileNotFoundError: no such run, or no such model in it
     """
     found: list[tuple[FoundModel, EnvironmentName]] = []

@@ -22,7 +22,7 @@ from sb3_dtfm.finetuning import FINETUNED, FinetunedDTFM, NoiseActionVecEnv, Onl
 from sb3_dtfm.finetuning.noise_env import NOISE_SPACE_FLOW_STEPS
 from sb3_dtfm.finetuning.online import ACCEPTED
 from sb3_dtfm.policies import SequencePolicy
-from sb3_dtfm.zoo.arguments import UsageError, asking_for
+from sb3_dtfm.zoo.arguments import UsageError, with_target_return
 from sb3_dtfm.zoo.manager import OF_RL_ZOO, OfflineExperimentManager
 from sb3_dtfm.zoo.resuming import EPISODES, StopSignals
 
@@ -119,7 +119,7 @@ class FinetuningManager(OfflineExperimentManager):
     RL-Zoo's own manager, for what goes on from a DTFM in the environment of that DTFM's run.
 
     :param base: file of the DTFM, or folder of its run
-    :param target_return: to ask for; by default as in that run
+    :param target_return: environment reward units; by default as in that run
     :param evaluations_of_a_run: after equal shares of the timesteps; None where `eval_freq` says how often
     """
 
@@ -155,10 +155,10 @@ class FinetuningManager(OfflineExperimentManager):
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = hyperparams.get("env_kwargs") or self.env_kwargs
         if self.target_return is not None:
-            hyperparams["env_wrapper"] = asking_for(self.target_return, hyperparams.get("env_wrapper"))
+            hyperparams["env_wrapper"] = with_target_return(self.target_return, hyperparams.get("env_wrapper"))
         if not hyperparams.get("env_wrapper"):
             raise UsageError(
-                f"--target-return R: needed, as {self.base} does not tell what return was asked for; "
+                f"--target-return R: needed, as {self.base} does not hold the target return of its training; "
                 "`sb3-dtfm inspect DATASET` suggests one."
             )
         if self.evaluations_of_a_run is not None:
@@ -272,7 +272,7 @@ class FinetunedManager(FinetuningManager):
 
 class OnlineManager(FinetuningManager):
     """
-    The DTFM itself goes on learning, as an :class:`~sb3_dtfm.finetuning.OnlineDTFM`. What comes of it is a run of "dtfm".
+    The DTFM itself goes on learning, as an :class:`~sb3_dtfm.finetuning.OnlineDTFM`. The result is a run of "dtfm".
 
     The dataset is that of the DTFM's run. Own episodes are kept beside the model; who goes on from there takes them up.
     """

@@ -1,4 +1,4 @@
-"""What a repository of Hugging Face's hub holds of a trained model, and what of it is believed by who downloads it."""
+"""Repositories of Hugging Face's hub: their content, and the part of it that a download trusts."""
 
 import argparse
 import json
@@ -28,11 +28,11 @@ class HubError(OSError):
 
 class Settings(NamedTuple):
     """
-    What acting needs besides the model.
+    Everything that acting needs besides the model.
 
     :param algo: a key of `ALGORITHMS`
     :param env: Gymnasium id
-    :param target_return: to ask for, in reward units
+    :param target_return: in reward units
     :param env_kwargs: of ``gymnasium.make``, values of JSON
     """
 
@@ -43,7 +43,7 @@ class Settings(NamedTuple):
 
     @property
     def model_name(self) -> ModelName:
-        """Of the model and, if nobody says otherwise, of its repository."""
+        """Of the model and, by default, of its repository."""
         return ModelName(self.algo, EnvironmentName(self.env))
 
     def write(self, folder: Path) -> None:
@@ -99,7 +99,7 @@ class Settings(NamedTuple):
 
 class Result(NamedTuple):
     """
-    What an evaluation came to.
+    Result of an evaluation.
 
     :param mean_reward: over the episodes
     :param std_reward: over the episodes
@@ -113,7 +113,7 @@ class Result(NamedTuple):
 
 def target_return_of(hyperparams: Mapping[str, Any]) -> float:
     """
-    What a run asks for. RL-Zoo imports and calls what `env_wrapper` names, so a repository says no more than this number.
+    A run's target return. RL-Zoo imports and calls what `env_wrapper` names, so a repository holds this number alone.
 
     :param hyperparams: of the run
     :raises UsageError: it acts behind another wrapper
@@ -154,7 +154,7 @@ def write_card(
     env_kwargs = f", **{settings.env_kwargs!r}" if settings.env_kwargs else ""
     text = f"""
 # {algorithm} on {settings.env}
-Trained by offline reinforcement learning, with sb3-dtfm on Stable-Baselines3. In {result.n_episodes} episodes that ask for a
+Trained by offline reinforcement learning, with sb3-dtfm on Stable-Baselines3. In {result.n_episodes} episodes with a target
 return of {settings.target_return:g} it reached {result.mean_reward:.2f} ± {result.std_reward:.2f} (standard deviation).
 {f"[Video]({VIDEO})" if has_video else ""}
 

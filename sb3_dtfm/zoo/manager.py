@@ -25,7 +25,7 @@ from sb3_dtfm.arguments import COUNT, Number, with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.distributed import is_first_process
 from sb3_dtfm.files import CLASSES
-from sb3_dtfm.zoo.arguments import Restored, UsageError, asked_for, asking_for, check_device
+from sb3_dtfm.zoo.arguments import Restored, UsageError, check_device, find_target_return, with_target_return
 from sb3_dtfm.zoo.comparison import MeasureRandomActions, compare
 from sb3_dtfm.zoo.registration import with_policy_options
 from sb3_dtfm.zoo.resuming import CHECKPOINT, KeepCheckpoint, ReplaceEvaluations, Start, StopSignals, go_on
@@ -50,7 +50,7 @@ class OfflineExperimentManager(ExperimentManager):
     RL-Zoo's own manager, for all of its algorithms, and what offline learning needs beside it.
 
     - A run that ends before it has a model leaves no folder, where `enjoy` would look for the latest run.
-    - An environment of dt or dtfm always shows a return-to-go, and the run's settings say which target return it asks for.
+    - An environment of dt or dtfm always shows a return-to-go, and the run's settings hold its target return.
     - dt and dtfm are evaluated before the first gradient step and after the last one too.
     - Of the processes of one training, the first alone runs callbacks.
     - They keep a checkpoint while they train, and a run goes on from it.
@@ -136,7 +136,7 @@ class OfflineExperimentManager(ExperimentManager):
         hyperparams = with_policy_options(hyperparams)
         if self.learns_offline:
             wrappers = hyperparams.get("env_wrapper")
-            hyperparams = {**hyperparams, "env_wrapper": asking_for(asked_for(wrappers), wrappers)}
+            hyperparams = {**hyperparams, "env_wrapper": with_target_return(find_target_return(wrappers), wrappers)}
         return hyperparams, OrderedDict(sorted(hyperparams.items()))
 
     @property
@@ -168,7 +168,7 @@ class OfflineExperimentManager(ExperimentManager):
         :param saved: the settings
         """
         assert model.env is not None
-        saved["env_wrapper"] = asking_for(model.env.get_attr("target_return")[0], saved["env_wrapper"])
+        saved["env_wrapper"] = with_target_return(model.env.get_attr("target_return")[0], saved["env_wrapper"])
         Path(self.params_path, "config.yml").write_text(yaml.dump(saved))
 
     def _check_names(self, error: TypeError) -> None:

@@ -49,7 +49,7 @@ def draw(name: str, arguments: Sequence[str]) -> list[Path]:
 
 
 def _folder(arguments: Sequence[str]) -> tuple[Path | None, list[str]]:
-    """What `--figures` names, and the arguments without it."""
+    """Folder that `--figures` names, and the other arguments."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--figures", type=Path)
     options, others = parser.parse_known_args(arguments)

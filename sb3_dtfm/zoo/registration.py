@@ -14,11 +14,11 @@ from sb3_dtfm.envs import register_gymnasium_robotics
 from sb3_dtfm.finetuning import FINETUNED, FinetunedDTFM
 from sb3_dtfm.policies import SequencePolicy
 
-# What `finetune --algo` calls a DTFM that goes on by itself; its run is one of this algorithm, as any other.
+# Name of filtered imitation in `finetune --algo`; its run is one of this algorithm, as any other.
 ONLINE = "dtfm"
-# Where settings of the online algorithms are.
+# Folder of the online algorithms' settings.
 FINETUNING_CONFIGS = "sb3_dtfm.zoo_configs.finetune"
-# What `--conf-file` accepts besides files and Python packages; None is no `--conf-file` at all.
+# Values of `--conf-file` besides files and Python packages; None is no `--conf-file` at all.
 PACKAGED_CONFIGS = {None: "sb3_dtfm.zoo_configs", "paper": "sb3_dtfm.zoo_configs.paper"}
 
 
@@ -38,7 +38,7 @@ def packaged_config(algo: str, name: str | None = None) -> Path:
     """
     Hyperparameter file that comes with the package.
 
-    :param algo: a key of `ALGORITHMS`; DT's settings, which are those of the trunk, serve a head without a file of its own
+    :param algo: a key of `ALGORITHMS`; DT's settings, those of the Transformer, serve a head without a file of its own
     :param name: None for the recommended settings, "paper" for those of the method's paper
     """
     folder = resources.files(PACKAGED_CONFIGS[name])
@@ -112,7 +112,7 @@ def sample_params(
     algo: str, trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
 ) -> dict[str, Any]:
     """
-    Search space: the trunk's, the same for all algorithms, and the head's own.
+    Search space: the Transformer's, the same for all algorithms, and the head's own.
 
     :param algo: a key of `ALGORITHMS`
     :param trial: the trial that draws
@@ -121,11 +121,11 @@ def sample_params(
     :param additional_args: unused
     :return: constructor arguments
     """
-    return convert_params(algo, {**_sample_trunk(trial), **policy_of(algo).head_class.search_space(trial)})
+    return convert_params(algo, {**_sample_transformer(trial), **policy_of(algo).head_class.search_space(trial)})
 
 
-def _sample_trunk(trial: optuna.Trial) -> dict[str, Any]:
-    """What both algorithms share: optimiser, context and Transformer."""
+def _sample_transformer(trial: optuna.Trial) -> dict[str, Any]:
+    """Shared by both algorithms: optimiser, context and Transformer."""
     return {
         "learning_rate": trial.suggest_float("learning_rate", 3e-5, 3e-3, log=True),
         "batch_size_pow": trial.suggest_int("batch_size_pow", 5, 8),

@@ -1,4 +1,4 @@
-"""What MuJoCo draws with on a machine without a screen, found by trying."""
+"""Renderer of MuJoCo on a machine without a screen, found by trying."""
 
 import contextlib
 import importlib

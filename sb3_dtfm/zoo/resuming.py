@@ -87,7 +87,7 @@ class StopSignals:
 
     The second one interrupts at once. Where several processes train together, signals do what they did.
 
-    :param between_steps: False where nobody looks at `asked` between steps: the first one interrupts at once, too
+    :param between_steps: False where `asked` is not read between steps: the first one interrupts at once, too
     """
 
     def __init__(self, between_steps: bool) -> None:
@@ -304,8 +304,8 @@ def _take_up_evaluations(callback: EvalCallback, path: Path, num_timesteps: int)
         model = path.with_name("best_model.zip")
         if model.exists():
             raise UsageError(
-                f"{path}: expected the evaluations up to step {num_timesteps}, without which nobody knows how good {model} "
-                f"is ({type(error).__name__}: {error}). Put the file back, or rename {model} to keep it, and resume again."
+                f"{path}: expected the evaluations up to step {num_timesteps}, which tell the score of {model} "
+                f"({type(error).__name__}: {error}). Put the file back, or rename {model} to keep it, and resume again."
             ) from error
         return
     callback.evaluations_timesteps = kept["timesteps"]

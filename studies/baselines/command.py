@@ -5,8 +5,8 @@ DT, DTFM and their baselines, trained and evaluated on the same data and initial
     make baselines ARGUMENTS="--data can-few --algo dt dtfm bc --seeds 0"    # some of it
     python studies/summary.py mine                                      # the rows as a table
 
-A cell that is finished in the results folder is not run again; a kill loses at most the running one (ours goes on from its
-checkpoint). Two calls of the command, one for each core, share the cells between them.
+A run that is finished in the results folder is not started again; a kill loses at most the running one (ours goes on from
+its checkpoint). Two calls of the command, one for each core, share the runs between them.
 """
 
 import argparse
@@ -23,13 +23,13 @@ import yaml
 from filelock import FileLock, Timeout
 from tqdm import tqdm
 
-from baselines.cells import (
+from baselines.entries import (
     HERE,
     KINDS,
     WORKERS,
     Baseline,
     Data,
-    baseline_cell,
+    baseline_key,
     budget_of,
     check_same,
     read_entries,
@@ -91,7 +91,7 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
 
 def choose(names: Sequence[str] | None, known: Sequence[str], option: str) -> list[str]:
     """
-    :param names: asked for, None for all
+    :param names: the user's, None for all
     :raises UsageError: one is not known
     """
     if unknown := [name for name in names or () if name not in known]:
@@ -99,11 +99,11 @@ def choose(names: Sequence[str] | None, known: Sequence[str], option: str) -> li
     return list(known if names is None else dict.fromkeys(names))
 
 
-def ready(data: Data, asked_for: bool) -> bool:
+def ready(data: Data, named: bool) -> bool:
     """
     Whether the task is installed and the data can be read.
 
-    :param asked_for: by name; what nobody asked for is left out where its task's package is missing, and said so
+    :param named: the user named it; otherwise it is left out, with a message, if its task's package is missing
     :raises UsageError: a package is missing, or the dataset
     """
     if data.kind not in KINDS:
@@ -111,7 +111,7 @@ def ready(data: Data, asked_for: bool) -> bool:
     try:
         import_packages(data.gym_packages)
     except UsageError as error:
-        if asked_for:
+        if named:
             raise
         print(f"{data.name}: left out. {error}")
         return False
@@ -142,7 +142,7 @@ def run_ours(data: Data, algos: Sequence[str], seed: int, options: argparse.Name
     """
     Run DT and DTFM as `sb3-dtfm benchmark` does.
 
-    :return: how many of the cells are not finished: 0, or 1 for any number
+    :return: how many of the runs are not finished: 0, or 1 for any number
     """
     label = "-".join(filter(None, (data.name, options.label)))
     asked = {"dataset": data.dataset, "target_return": data.target_return, "recorded_from": data.recorded_from}
@@ -166,25 +166,25 @@ def run_ours(data: Data, algos: Sequence[str], seed: int, options: argparse.Name
     return 0
 
 
-def run_cell(data: Data, baseline: Baseline, seed: int, options: argparse.Namespace) -> int:
+def train_and_evaluate(data: Data, baseline: Baseline, seed: int, options: argparse.Namespace) -> int:
     """
-    Run a baseline's cell, unless it is finished or another call of the command is at it.
+    Train and evaluate a baseline, unless it is finished or another call of the command is at it.
 
     :return: 1 if it is not finished
     """
-    cell = baseline_cell(data, baseline, seed, options.label)
+    key = baseline_key(data, baseline, seed, options.label)
     results, logs = Path(options.results), Path(options.log_folder)
     (results / ".locks").mkdir(parents=True, exist_ok=True)
     logs.mkdir(parents=True, exist_ok=True)
-    rows, log = results / f"{cell.file_name}.jsonl", logs / f"{cell.file_name}.log"
+    rows, log = results / f"{key.file_name}.jsonl", logs / f"{key.file_name}.log"
     try:
-        with FileLock(results / ".locks" / f"{cell.file_name}.lock").acquire(timeout=0):
+        with FileLock(results / ".locks" / f"{key.file_name}.lock").acquire(timeout=0):
             if rows.exists():
                 check_same(rows, row_settings(data, baseline, budget_of(data, baseline, options)))
-                print(f"{cell}: finished already", flush=True)
+                print(f"{key}: finished already", flush=True)
                 return 0
             start = time.monotonic()
-            with tqdm(desc=str(cell), leave=False, mininterval=0.5 if sys.stderr.isatty() else 60.0) as bar:
+            with tqdm(desc=str(key), leave=False, mininterval=0.5 if sys.stderr.isatty() else 60.0) as bar:
 
                 def say(done: int, n_steps: int, what: str) -> None:
                     bar.total = n_steps
@@ -195,14 +195,14 @@ def run_cell(data: Data, baseline: Baseline, seed: int, options: argparse.Namesp
             with replacing(rows) as beside:
                 write_row(beside, row)
     except Timeout:
-        print(f"{cell}: another process is running it", flush=True)
+        print(f"{key}: another process is running it", flush=True)
         return 1
     except BaselineError as error:
-        print(f"{cell}: FAILED. {error}", flush=True)
+        print(f"{key}: FAILED. {error}", flush=True)
         return 1
     minutes = row["wall_s"] / 60
     print(
-        f"{cell}: {row['step']:,} gradient steps in {minutes:.1f} minutes, done in {(time.monotonic() - start) / 60:.1f}",
+        f"{key}: {row['step']:,} gradient steps in {minutes:.1f} minutes, done in {(time.monotonic() - start) / 60:.1f}",
         flush=True,
     )
     return 0
@@ -212,7 +212,7 @@ def main(argv: Sequence[str]) -> None:
     """
     Check everything that is asked for, and run what is missing of it.
 
-    :raises SystemExit: with code 1 if a cell is not finished, 130 if interrupted
+    :raises SystemExit: with code 1 if a run is not finished, 130 if interrupted
     :raises UsageError: something does not fit; nothing was run
     """
     options = parse_arguments(argv)
@@ -224,16 +224,18 @@ def main(argv: Sequence[str]) -> None:
     )
     check_workers(baselines, options)
     names = choose(options.data, list(known_data), "--data")
-    chosen = [known_data[name] for name in names if ready(known_data[name], asked_for=options.data is not None)]
+    chosen = [known_data[name] for name in names if ready(known_data[name], named=options.data is not None)]
     n_left = 0
     for seed in dict.fromkeys(options.seeds):  # outermost: a run that is cut short has seen all data
         for data in chosen:
             n_left += run_ours(data, ours, seed, options) if ours else 0
-            n_left += sum(run_cell(data, baseline, seed, options) for baseline in baselines if data.kind in baseline.only)
+            n_left += sum(
+                train_and_evaluate(data, baseline, seed, options) for baseline in baselines if data.kind in baseline.only
+            )
     if n_left:
-        print("Some cells failed, or are left to other processes; the same command goes on.")
+        print("Some runs failed, or are left to other processes; the same command goes on.")
         raise SystemExit(1)
-    print(f"All cells are finished: python studies/summary.py {options.results}")
+    print(f"All runs are finished: python studies/summary.py {options.results}")
 
 
 def run() -> None:

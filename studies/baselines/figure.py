@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from baselines.table import Cells, read
+from baselines.table import Grouped, read
 
 # Ours in colours of their own, the others in grey shapes.
 OURS = {"dt": ("DT", "D", "C1"), "dtfm": ("DTFM", "o", "C0"), "dtfm, best-of-n": ("DTFM, best-of-N", "*", "C3")}
@@ -33,14 +33,14 @@ def plot(folder: Path, output: Path) -> None:
     :param folder: of rows
     :param output: the PNG
     """
-    cells, datasets, _ = read(folder)
+    grouped, datasets, _ = read(folder)
     figure = Figure(figsize=(9.0, 0.42 * len(datasets) + 1.0), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
     styles = {name: (label, marker, "0.55", 5.0) for name, (label, marker) in OTHERS.items()}
     styles |= {name: (*style, 8.0) for name, style in OURS.items()}
     for algo, (label, marker, colour, size) in styles.items():
-        shares = {row: _mean(cells, name, algo) / _best(cells, name, styles) for row, name in enumerate(datasets)}
+        shares = {row: _mean(grouped, name, algo) / _best(grouped, name, styles) for row, name in enumerate(datasets)}
         found = {row: max(share, 0.0) for row, share in shares.items() if not np.isnan(share)}
         shown: dict[str, Any] = {
             "color": colour,
@@ -59,15 +59,15 @@ def plot(folder: Path, output: Path) -> None:
     figure.savefig(output, dpi=110)
 
 
-def _mean(cells: Cells, name: str, algo: str) -> float:
+def _mean(grouped: Grouped, name: str, algo: str) -> float:
     """Over seeds; NaN where there are none."""
-    runs = cells.get((name, algo), [])
+    runs = grouped.get((name, algo), [])
     return float(np.mean([float(run.value("final") or 0.0) for run in runs])) if runs else np.nan
 
 
-def _best(cells: Cells, name: str, algos: Iterable[str]) -> float:
+def _best(grouped: Grouped, name: str, algos: Iterable[str]) -> float:
     """The largest mean on a dataset."""
-    return float(np.nanmax([_mean(cells, name, algo) for algo in algos]))
+    return float(np.nanmax([_mean(grouped, name, algo) for algo in algos]))
 
 
 def main() -> None:

@@ -163,8 +163,8 @@ def _planned_steps(job: dict[str, Any], make: MakeLearner, dataset: Dataset) -> 
     most = int(job["n_timesteps"])
     if job["minutes"] is None:
         return most
-    pace = _seconds_per_step(make(job["settings"], dataset, most, job["seed"]))
-    return max(1, min(most, int(60.0 * job["minutes"] / pace)))
+    seconds = _seconds_per_step(make(job["settings"], dataset, most, job["seed"]))
+    return max(1, min(most, int(60.0 * job["minutes"] / seconds)))
 
 
 def _train(job: dict[str, Any], make: MakeLearner, dataset: Dataset, stream: BinaryIO) -> Learner:

@@ -13,30 +13,30 @@ from pathlib import Path
 
 import numpy as np
 
-from baselines.cells import HERE, Baseline, Data, read_entries
+from baselines.entries import HERE, Baseline, Data, read_entries
 from baselines.process import STUDIES
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.report.runs import Run, read_studies
 from sb3_dtfm.benchmark.report.statistics import student_t
 
 NONE = "-"
-Cells = dict[tuple[str, str], list[Run]]  # by dataset and algorithm
+Grouped = dict[tuple[str, str], list[Run]]  # by dataset and algorithm
 # What studies/suite.yml calls a dataset of studies/baselines.yml, where it has another name there.
 IN_SUITE = {"can-few": "can-10", "walker2d-clean": "walker2d-expert", "pusht-human": "pusht"}
 
 
-def read(folder: Path) -> tuple[Cells, list[str], list[str]]:
+def read(folder: Path) -> tuple[Grouped, list[str], list[str]]:
     """The runs, their datasets and their algorithms, as the YAML files have them; the rest of a label names the latter."""
     datasets = list(read_entries(STUDIES / "baselines.yml", Data))
     known = [*ALGORITHMS, *read_entries(HERE / "settings.yml", Baseline)]
-    cells: Cells = {}
+    grouped: Grouped = {}
     for group in (group for study in read_studies([folder]) for group in study.groups):
         name = max((each for each in datasets if f"{group.label}-".startswith(f"{each}-")), key=len)
         changed = group.label[len(name) + 1 :]
         for (_, _, algo), runs in group.runs.items():
-            cells.setdefault((name, ", ".join(filter(None, (algo, changed)))), []).extend(runs)
-    algorithms = sorted({algo for _, algo in cells}, key=lambda algo: (known.index(algo.partition(",")[0]), algo))
-    return cells, [name for name in datasets if any(name == each for each, _ in cells)], algorithms
+            grouped.setdefault((name, ", ".join(filter(None, (algo, changed)))), []).extend(runs)
+    algorithms = sorted({algo for _, algo in grouped}, key=lambda algo: (known.index(algo.partition(",")[0]), algo))
+    return grouped, [name for name in datasets if any(name == each for each, _ in grouped)], algorithms
 
 
 def result(runs: Sequence[Run]) -> str:
@@ -55,15 +55,15 @@ def mean_of(runs: Sequence[Run], key: str, form: str) -> str:
 
 def long_table(folder: Path) -> Iterable[Sequence[str]]:
     """Lines of results, minutes of training, gradient steps, and milliseconds an action."""
-    cells, datasets, algorithms = read(folder)
+    grouped, datasets, algorithms = read(folder)
     yield "data", "algorithm", "seeds", "final", "each seed", "minutes", "gradient steps", "ms an action", "commits"
     for name in datasets:
         for algo in algorithms:
-            if runs := cells.get((name, algo)):
+            if runs := grouped.get((name, algo)):
                 yield (
                     name,
                     algo,
-                    ", ".join(str(run.cell.seed) for run in runs),
+                    ", ".join(str(run.key.seed) for run in runs),
                     result(runs),
                     "; ".join(f"{run.value('final'):,.0f}" for run in runs),
                     f"{np.mean([run.minutes for run in runs]):.1f}",
@@ -75,35 +75,34 @@ def long_table(folder: Path) -> Iterable[Sequence[str]]:
 
 def short_table(folder: Path) -> Iterable[Sequence[str]]:
     """Lines of results alone, the largest mean in bold."""
-    cells, datasets, algorithms = read(folder)
+    grouped, datasets, algorithms = read(folder)
     yield "data", *algorithms
     for name in datasets:
-        runs = {algo: cells[name, algo] for algo in algorithms if (name, algo) in cells}
+        runs = {algo: grouped[name, algo] for algo in algorithms if (name, algo) in grouped}
         means = {algo: float(np.mean([run.value("final") for run in each])) for algo, each in runs.items()}
         bold = {algo: "**" if mean == max(means.values()) else "" for algo, mean in means.items()}
         yield name, *(f"{bold[algo]}{result(runs[algo])}{bold[algo]}" if algo in runs else NONE for algo in algorithms)
 
 
 def suite_table(folder: Path, suite: Path) -> Iterable[Sequence[str]]:
-    """Lines of DT and DTFM by the classes' defaults and by the settings before them, and of the best other algorithm."""
-    cells, datasets, algorithms = read(folder)
-    defaults: Cells = {}
+    """Lines of DT and DTFM by the classes' defaults, and of the best other algorithm."""
+    grouped, datasets, algorithms = read(folder)
+    defaults: Grouped = {}
     for group in (group for study in read_studies([suite]) for group in study.groups):
         for (task, _, algo), runs in group.runs.items():
             defaults.setdefault((task, algo), []).extend(runs)
-    yield "data", "DT", "DTFM", "DT before", "DTFM before", "best of the others"
+    yield "data", "DT", "DTFM", "best of the others"
     for name in datasets:
         ours = [defaults.get((IN_SUITE.get(name, name), algo)) for algo in ("dt", "dtfm")]
         if not any(ours):
             continue
-        before = [cells.get((name, algo)) for algo in ("dt", "dtfm")]
         others = {
-            algo: cells[name, algo]
+            algo: grouped[name, algo]
             for algo in algorithms
-            if algo.partition(",")[0] not in ALGORITHMS and (name, algo) in cells
+            if algo.partition(",")[0] not in ALGORITHMS and (name, algo) in grouped
         }
         best = max(others, key=lambda algo: float(np.mean([run.value("final") for run in others[algo]])))
-        yield name, *(result(runs) if runs else NONE for runs in (*ours, *before)), f"{best}: {result(others[best])}"
+        yield name, *(result(runs) if runs else NONE for runs in ours), f"{best}: {result(others[best])}"
 
 
 def main() -> None:

@@ -99,7 +99,7 @@ def main() -> None:
     if options.second:
         envs["second simulation"] = make_env(options.second)
     others = list(envs)[1:]
-    print("| asked | " + " | ".join([*envs, *(f"ours / {name}" for name in others), "falls"]) + " |")
+    print("| command | " + " | ".join([*envs, *(f"ours / {name}" for name in others), "falls"]) + " |")
     print("| --- |" + " --- |" * (len(envs) + len(others) + 1))
     for command in COMMANDS:
         axis = int(np.argmax(np.abs(command)))

@@ -118,7 +118,7 @@ class Recorder:
             minari = Path(sys.executable).with_name("minari")
             run([str(minari), "combine", "--dataset-id", dataset_id, *parts])
 
-    def ladder(self, dataset_id: str, env_id: str, models: list[str], episodes: int, *options: str) -> None:
+    def several_agents(self, dataset_id: str, env_id: str, models: list[str], episodes: int, *options: str) -> None:
         """As many episodes of each of several agents."""
         parts = [f"{dataset_id.rsplit('-', 1)[0]}-{model}-v0" for model in models]
         for part, model in zip(parts, models, strict=True):
@@ -175,19 +175,21 @@ def steps(recorder: Recorder) -> dict[str, Callable[[], None]]:
     return {
         "hopper-expert": lambda: r.agent("local/hopper/expert-v0", "ppo", "Hopper-v5", 20),
         "pendulum": lambda: r.agent("local/pendulum/sac-v0", "sac-Pendulum", "Pendulum-v1", 30),
-        "halfcheetah-ladder": lambda: r.ladder("local/halfcheetah/ladder-v0", "HalfCheetah-v5", everyone, 15),
-        "walker2d-ladder": lambda: r.ladder("local/walker2d/ladder-v0", "Walker2d-v5", everyone, 15),
-        "halfcheetah-mediocre-noisy": lambda: r.ladder(
+        "halfcheetah-mixed-quality": lambda: r.several_agents(
+            "local/halfcheetah/mixed-quality-v0", "HalfCheetah-v5", everyone, 15
+        ),
+        "walker2d-mixed-quality": lambda: r.several_agents("local/walker2d/mixed-quality-v0", "Walker2d-v5", everyone, 15),
+        "halfcheetah-mediocre-noisy": lambda: r.several_agents(
             "local/halfcheetah/mediocre-noisy-v0", "HalfCheetah-v5", ["trpo", "a2c", "ppo"], 50, *noisy
         ),
-        "walker2d-mediocre-noisy": lambda: r.ladder(
+        "walker2d-mediocre-noisy": lambda: r.several_agents(
             "local/walker2d/mediocre-noisy-v0", "Walker2d-v5", ["a2c", "trpo", "sac"], 50, *noisy
         ),
         "pusht": r.pusht,
         "can": lambda: r.demonstrations("can", "can", 200),
         "lift-paused": lambda: r.demonstrations("lift_paused", "lift", 200, "--pause", "20"),
-        "hopper-ladder": lambda: r.ladder(
-            "local/hopper/ladder-v0", "Hopper-v5", ["sac-Hopper-10000", "sac-Hopper-20000", "sac-Hopper", "ppo"], 15
+        "hopper-mixed-quality": lambda: r.several_agents(
+            "local/hopper/mixed-quality-v0", "Hopper-v5", ["sac-Hopper-10000", "sac-Hopper-20000", "sac-Hopper", "ppo"], 15
         ),
         "can-dropped": r.dropped,
         "lift": lambda: r.demonstrations("lift", "lift", 200),
@@ -200,8 +202,11 @@ def steps(recorder: Recorder) -> dict[str, Callable[[], None]]:
         "inverted-double-pendulum": lambda: r.agent(
             "local/idp/sac-v0", "sac-InvertedDoublePendulum", "InvertedDoublePendulum-v5", 20, sampled
         ),
-        "cartpole": lambda: r.ladder(
-            "local/cartpole/ladder-v0", "CartPole-v1", ["dqn-CartPole-10000", "dqn-CartPole-20000", "dqn-CartPole"], 15
+        "cartpole": lambda: r.several_agents(
+            "local/cartpole/mixed-quality-v0",
+            "CartPole-v1",
+            ["dqn-CartPole-10000", "dqn-CartPole-20000", "dqn-CartPole"],
+            15,
         ),
         "mountain-car": lambda: r.agent(
             "local/mountaincar/sac-v0", "sac-MountainCarContinuous", "MountainCarContinuous-v0", 30, sampled

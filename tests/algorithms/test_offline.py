@@ -121,7 +121,7 @@ def test_the_seed_decides_everything(cheetah_buffer):
     assert not th.equal(weights(first), weights(make_model(DTFM, cheetah_buffer, seed=4).learn(5)))
 
 
-def test_both_algorithms_start_from_the_same_trunk_and_learn_from_the_same_half(cheetah_buffer):
+def test_both_algorithms_start_from_the_same_transformer_and_learn_from_the_same_half(cheetah_buffer):
     dt, dtfm = (make_model(algorithm, cheetah_buffer, dataset_kwargs=dict(fraction=0.5), seed=1) for algorithm in (DT, DTFM))
     for ours, theirs in zip(dt.policy.network.trunk.parameters(), dtfm.policy.network.trunk.parameters(), strict=True):
         assert th.equal(ours, theirs)

@@ -1,4 +1,4 @@
-"""What a model asks for, and that its environments ask for it, however they come."""
+"""A model's target return, which its environments take, however they come."""
 
 import json
 import zipfile
@@ -36,12 +36,12 @@ def targets(env) -> list[float | None]:
 
 
 @pytest.mark.parametrize("env", [CHEETAH, make_bare_env, lambda: Monitor(make_bare_env()), make_env_without_target])
-def test_any_environment_asks_for_what_inspect_suggests(env, cheetah_buffer, capsys):
+def test_any_environment_takes_the_target_that_inspect_suggests(env, cheetah_buffer, capsys):
     suggested = inspect_buffer(cheetah_buffer).target_return
     model = make_model(DTFM, cheetah_buffer, env=env if isinstance(env, str) else env(), verbose=1)
     assert (model.target_return, targets(model.get_env())) == (suggested, [suggested])
     said = capsys.readouterr().out
-    assert f"asks for target_return={suggested:g}, as `sb3-dtfm inspect` suggests of the recorded returns." in said
+    assert f"has target_return={suggested:g}, as `sb3-dtfm inspect` suggests of the recorded returns." in said
     assert ("Wrapping the env in a ReturnToGoWrapper." in said) is (env is not make_env_without_target)
     assert model.get_env().reset()["return_to_go"] == np.float32(suggested)
 
@@ -88,7 +88,7 @@ def test_the_target_is_saved_and_given_to_new_environments(algorithm, cheetah_bu
     assert np.isfinite(mean)
 
 
-def test_a_file_without_a_target_loads_and_asks_for_what_its_environment_does(cheetah_buffer, tmp_path):
+def test_a_file_without_a_target_loads_and_takes_that_of_its_environment(cheetah_buffer, tmp_path):
     make_model(DT, cheetah_buffer).save(tmp_path / "model", exclude=["target_return"])
     loaded = DT.load(tmp_path / "model")
     assert loaded.target_return is None
@@ -163,7 +163,7 @@ def test_evaluate_policy_without_the_wrapper_says_what_to_write(cheetah_buffer):
     assert np.isfinite(evaluate_policy(model, model.get_env(), 1)[0])
 
 
-def test_an_online_algorithms_environment_asks_for_the_frozen_models_target(cheetah_buffer):
+def test_an_online_algorithms_environment_takes_the_frozen_models_target(cheetah_buffer):
     model = make_model(DTFM, cheetah_buffer)
     env = NoiseActionVecEnv(DummyVecEnv([make_env_without_target]), model)
     env.reset()

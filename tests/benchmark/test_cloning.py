@@ -1,4 +1,4 @@
-"""Behaviour cloning as a cell of the grid: what it learns, from which episodes, and the rows that it leaves."""
+"""Behaviour cloning as a run of the grid: what it learns, from which episodes, and the rows that it leaves."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from stable_baselines3.common.callbacks import CallbackList
 
 from sb3_dtfm.benchmark import cloning
 from sb3_dtfm.benchmark.evaluation import EvaluationCallback
-from sb3_dtfm.benchmark.rows import BASELINES, Cell, read_rows
+from sb3_dtfm.benchmark.rows import BASELINES, RunKey, read_rows
 from sb3_dtfm.benchmark.runner import CALLBACK
 from sb3_dtfm.benchmark.settings import Task, cloning_settings, task_settings
 from sb3_dtfm.data import load_dataset
@@ -57,7 +57,7 @@ def test_it_chooses_discrete_actions_as_they_were_chosen():
 
 
 @pytest.mark.parametrize(("algo", "push"), [("bc", -1.5), ("bc-best", 1.5)])
-def test_a_cell_learns_from_all_episodes_or_the_best_tenth_and_leaves_the_rows_of_any_cell(
+def test_a_run_learns_from_all_episodes_or_the_best_tenth_and_leaves_the_rows_of_any_run(
     algo, push, tmp_path, monkeypatch, capsys
 ):
     models = []
@@ -72,7 +72,7 @@ def test_a_cell_learns_from_all_episodes_or_the_best_tenth_and_leaves_the_rows_o
     task = Task("pushed", str(tmp_path / "data.npz"), -5.0, task="Pendulum-v1", env_kwargs={"max_episode_steps": 8})
     settings = cloning_settings(algo, task_settings("default", "dt", task, 1.0, None, {}), 200)
     assert (settings["n_timesteps"], settings["best_share"]) == (200, BASELINES[algo])
-    row = {**Cell("pushed", 1.0, algo, 3, "default")._asdict(), "env_id": "Pendulum-v1", "settings": settings, "data": {}}
+    row = {**RunKey("pushed", 1.0, algo, 3, "default")._asdict(), "env_id": "Pendulum-v1", "settings": settings, "data": {}}
     arguments = dict(rows=str(tmp_path / "rows.jsonl"), row=row, eval_freq=100, n_episodes=2, n_final_episodes=3)
     (tmp_path / "settings.yml").write_text(
         yaml.safe_dump({"Pendulum-v1": {**settings, "callback": [{CALLBACK: arguments}]}})

@@ -13,8 +13,8 @@ ROOT = Path(__file__).parents[2]
 # README's name of a data set of the suite, and the report's.
 IN_README = {
     "Hopper, one agent *": "hopper*",
-    "HalfCheetah, five agents *": "halfcheetah-ladder*",
-    "Walker2d, five agents": "walker2d-ladder",
+    "HalfCheetah, five agents *": "halfcheetah-mixed-quality*",
+    "Walker2d, five agents": "walker2d-mixed-quality",
     "Walker2d, three noisy agents *": "walker2d-mediocre-noisy*",
     "Swimmer, one agent": "swimmer",
     "Robosuite Stack, 50 scripted demonstrations": "stack-50",

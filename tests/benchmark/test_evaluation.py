@@ -23,7 +23,7 @@ from sb3_dtfm.benchmark.evaluation import (
     evaluate,
     make_seeded_envs,
 )
-from sb3_dtfm.benchmark.rows import Cell, read_rows
+from sb3_dtfm.benchmark.rows import RunKey, read_rows
 from sb3_dtfm.benchmark.runner import CALLBACK
 from sb3_dtfm.envs import ReturnToGoWrapper
 from tests.conftest import TINY_FLOW_POLICY
@@ -130,7 +130,7 @@ def row() -> dict[str, Any]:
     """What all rows of a run say: HalfCheetah in episodes of 5 steps."""
     wrapper = {"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 5.0}}
     settings = {"env_wrapper": [wrapper], "env_kwargs": {"max_episode_steps": 5}}
-    return {**Cell("HalfCheetah-v5", 1.0, "dtfm", 3, "tiny")._asdict(), "settings": settings, "data": {}}
+    return {**RunKey("HalfCheetah-v5", 1.0, "dtfm", 3, "tiny")._asdict(), "settings": settings, "data": {}}
 
 
 def make_model(buffer, learning_rate: float = 1e-3) -> DTFM:

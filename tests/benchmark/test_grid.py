@@ -1,4 +1,4 @@
-"""The grid: what it asks for, and a tiny real one that is killed and goes on."""
+"""The grid: its runs, and a tiny real one that is killed and goes on."""
 
 import json
 import os
@@ -24,14 +24,14 @@ from sb3_dtfm.cli.main import main
 from sb3_dtfm.data import load_dataset
 from sb3_dtfm.data.inspection import suggested_target_return
 from sb3_dtfm.heads import FlowHead
-from sb3_dtfm.zoo.arguments import UsageError, asked_for, asking_for
+from sb3_dtfm.zoo.arguments import UsageError, find_target_return, with_target_return
 from tests.recorded import DATASET_ID
 
 TASK = "HalfCheetah-v5"
 POLICY = dict(embed_dim=16, n_layers=1, n_heads=1, flow_hidden_dim=16, flow_n_layers=1, flow_steps=2)
 SETTINGS = dict(policy="MultiInputPolicy", n_timesteps=6, batch_size=4, context_length=3, policy_kwargs=POLICY)
 STEPS = [(0, False), (2, False), (4, False), (6, False), (6, True)]
-PATIENCE = 120  # seconds to wait for a cell
+PATIENCE = 120  # seconds to wait for a run
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def start(arguments: list[str]) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, "-m", "sb3_dtfm", *arguments], env=environment, stdout=subprocess.DEVNULL)
 
 
-def cells_of(grid: int) -> list[int]:
+def runs_of(grid: int) -> list[int]:
     """Processes that a grid's threads have started."""
     return [int(pid) for file in Path(f"/proc/{grid}/task").glob("*/children") for pid in file.read_text().split()]
 
@@ -68,29 +68,29 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
-def test_a_killed_grid_takes_its_cell_along_goes_on_and_repeats_nothing(grid, workplace, capfd, monkeypatch):
+def test_a_killed_grid_takes_its_run_along_goes_on_and_repeats_nothing(grid, workplace, capfd, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     grid += ["--fractions", "0.5"]
     process = start(grid)
     results, logs = workplace / "results", workplace / "logs" / "benchmark" / f"{TASK}_0.5_dtfm_seed0_tiny"
     wait_until(
-        lambda: process.poll() is not None or (any(results.glob("*.jsonl")) and logs.exists() and cells_of(process.pid))
+        lambda: process.poll() is not None or (any(results.glob("*.jsonl")) and logs.exists() and runs_of(process.pid))
     )
-    (orphan,) = cells_of(process.pid)
+    (orphan,) = runs_of(process.pid)
     process.send_signal(signal.SIGKILL)
     process.wait()
     wait_until(lambda: not is_running(orphan))
     assert not list(logs.glob("*/rows.jsonl"))
     (first,) = results.glob("*.jsonl")
     content, written = first.read_bytes(), first.stat().st_mtime_ns
-    # What a cell that was killed halfway leaves behind
+    # What a run that was killed halfway leaves behind
     broken = logs / "attempt-old"
     broken.mkdir()
     (broken / "rows.jsonl").write_text(content.decode().splitlines()[0] + "\n")
 
     assert main(grid) == 0
     output = capfd.readouterr().out
-    assert "1 cells to run, 1 finished already in results" in output
+    assert "1 runs to start, 1 finished already in results" in output
     assert "[1/1]" in output
     assert (first.read_bytes(), first.stat().st_mtime_ns) == (content, written)
     assert not broken.exists()
@@ -114,7 +114,7 @@ def test_a_killed_grid_takes_its_cell_along_goes_on_and_repeats_nothing(grid, wo
     assert DTFM.load(model).num_timesteps == 6
 
     assert main(grid) == 0
-    assert "0 cells to run, 2 finished already" in capfd.readouterr().out
+    assert "0 runs to start, 2 finished already" in capfd.readouterr().out
     assert main(["report", "results", "-o", "docs"]) == 0
     assert f"| {TASK} | 50% | *not run*" not in (workplace / "docs" / "report.md").read_text()
     assert main([*grid, "-n", "8"]) == 2
@@ -138,7 +138,7 @@ pathlib.Path(arguments["rows"]).write_text(json.dumps({{**arguments["row"], **ev
 
 @pytest.fixture
 def stub(workplace, monkeypatch):
-    """Cells that do nothing; `dtfm` does what is asked."""
+    """Runs that do nothing; `dtfm` does what is asked."""
 
     def use(instead: str) -> None:
         (workplace / "stub.py").write_text(STUB.format(instead=instead))
@@ -151,7 +151,7 @@ def stub(workplace, monkeypatch):
     ("instead", "says"),
     [("raise ValueError('in the midst')", "ValueError: in the midst"), ("sys.exit()", "nothing was written")],
 )
-def test_a_cell_that_fails_leaves_a_log_and_the_grid_goes_on(instead, says, grid, stub, workplace, capfd):
+def test_a_run_that_fails_leaves_a_log_and_the_grid_goes_on(instead, says, grid, stub, workplace, capfd):
     stub(instead)
     grid += ["--jobs", "2", "--algo", "dtfm", "dt", "--fractions", "1"]
     with pytest.raises(SystemExit) as exit_:
@@ -159,7 +159,7 @@ def test_a_cell_that_fails_leaves_a_log_and_the_grid_goes_on(instead, says, grid
     assert exit_.value.code == 1
     (log,) = (workplace / "logs" / "benchmark" / f"{TASK}_1_dtfm_seed0_tiny").glob("*/output.log")
     output = capfd.readouterr().out
-    assert "1 of 2 cells failed" in output
+    assert "1 of 2 runs failed" in output
     assert f"{log.relative_to(workplace)}: {says}" in output
     assert [path.name for path in (workplace / "results").glob("*.jsonl")] == [f"{TASK}_1_dt_seed0_tiny.jsonl"]
 
@@ -169,7 +169,7 @@ def test_a_cell_that_fails_leaves_a_log_and_the_grid_goes_on(instead, says, grid
     finished.rename(workplace / "results" / "study" / "rows.jsonl")
     stub("pass")
     assert main(grid) == 0
-    assert "1 cells to run, 1 finished already" in capfd.readouterr().out
+    assert "1 runs to start, 1 finished already" in capfd.readouterr().out
     assert not finished.exists()
 
 
@@ -179,7 +179,7 @@ def test_results_and_logs_may_share_a_folder(grid, stub, workplace):
     assert (workplace / "mine" / f"{TASK}_1_dt_seed0_tiny.jsonl").is_file()
 
 
-def test_an_interrupted_grid_ends_its_cells_and_says_so(grid, stub, workplace, monkeypatch, capfd):
+def test_an_interrupted_grid_ends_its_runs_and_says_so(grid, stub, workplace, monkeypatch, capfd):
     stub("pathlib.Path('asleep').touch(); time.sleep(600)")
     started = []
     popen = subprocess.Popen
@@ -196,13 +196,13 @@ def test_an_interrupted_grid_ends_its_cells_and_says_so(grid, stub, workplace, m
         main([*grid, "--fractions", "1"])
     assert exit_.value.code == 130
     output = capfd.readouterr().out
-    assert "Interrupted after 1 of 2 cells" in output
+    assert "Interrupted after 1 of 2 runs" in output
     assert "FAILED" not in output
     assert [process.returncode for process in started] == [0, -signal.SIGTERM]
     assert len(list((workplace / "results").glob("*.jsonl"))) == 1
 
 
-def test_a_cell_that_another_process_runs_is_left_to_it(grid, stub, workplace, capfd):
+def test_a_run_that_another_process_runs_is_left_to_it(grid, stub, workplace, capfd):
     stub("pass")
     locks = workplace / "results" / ".locks"
     locks.mkdir(parents=True)
@@ -211,7 +211,7 @@ def test_a_cell_that_another_process_runs_is_left_to_it(grid, stub, workplace, c
     assert exit_.value.code == 1
     output = capfd.readouterr().out
     assert f"{TASK}, 100% of the data, dt, seed 0, tiny: another process is running it" in output
-    assert "0 of 2 cells failed, 1 are left to other processes" in output
+    assert "0 of 2 runs failed, 1 are left to other processes" in output
     assert [path.name for path in (workplace / "results").glob("*.jsonl")] == [f"{TASK}_1_dtfm_seed0_tiny.jsonl"]
 
 
@@ -273,12 +273,12 @@ def suite(workplace) -> list[str]:
 
 def test_several_data_sets_of_a_task_are_told_apart_by_their_names(suite):
     jobs, _ = plan(parse_arguments(suite))
-    found = [(job.cell.task, job.cell.regime, job.cell.algo) for job in jobs]
+    found = [(job.key.task, job.key.regime, job.key.algo) for job in jobs]
     whole = [("whole", regime, algo) for regime in (1.0, 0.5) for algo in ("bc", "bc-best", "dt", "dtfm")]
     assert found == [*whole, *(("some", regime, algo) for regime in (1.0, 0.5) for algo in ("bc", "dt"))]
     assert {job.row["env_id"] for job in jobs} == {TASK}
     assert [job.data.get("chosen_with", False) for job in jobs] == [True] * 8 + [False] * 4
-    some = [job for job in jobs if job.cell.task == "some"]
+    some = [job for job in jobs if job.key.task == "some"]
     assert [job.settings["dataset_kwargs"]["fraction"] for job in some] == [0.67, 0.67, 0.335, 0.335]
     assert {job.data["n_episodes"] for job in some} == {2}, "of three, whatever share of the two is learned from"
     assert {job.data["n_steps"] for job in some} == {40}, "up to the time limit"
@@ -296,19 +296,19 @@ def test_what_the_command_says_of_data_and_environment_goes_before_the_entry_key
         "fraction": 0.67,
         "fraction_seed": 0,
     }
-    assert asked_for(job.settings["env_wrapper"]) == 9.0
+    assert find_target_return(job.settings["env_wrapper"]) == 9.0
 
 
 def test_the_data_suggest_a_return_to_ask_for_where_nobody_names_one(suite, workplace):
     """Nor the profile's is taken, which belongs to its own dataset."""
     (workplace / "tiny.yml").write_text(
-        yaml.safe_dump({"default": {**SETTINGS, "dataset": "their/own-v0", "env_wrapper": asking_for(7.0, [])}})
+        yaml.safe_dump({"default": {**SETTINGS, "dataset": "their/own-v0", "env_wrapper": with_target_return(7.0, [])}})
     )
     jobs, _ = plan(parse_arguments([*suite, "--env", "whole", "--fractions", "1", "0.4"]))
     buffer = load_dataset(DATASET_ID, max_episode_steps=10)
-    asked = {job.cell.regime: asked_for(job.settings["env_wrapper"]) for job in jobs}
+    targets = {job.key.regime: find_target_return(job.settings["env_wrapper"]) for job in jobs}
     shares = {regime: suggested_target_return(buffer.random_fraction(regime, 0)) for regime in (1.0, 0.4)}
-    assert asked == shares
+    assert targets == shares
     assert jobs[0].data["best_return"] == pytest.approx(buffer.episode_returns.max(), abs=1e-3)
 
 
@@ -325,7 +325,7 @@ def test_a_suite_with_behaviour_cloning_runs_is_not_run_again_and_makes_a_report
     finals = [each[-1] for each in rows.values()]
     assert len({row["data"]["random_return"] for row in finals}) == 1, "the same random actions for all"
     assert main(command) == 0
-    assert "0 cells to run, 2 finished already" in capfd.readouterr().out
+    assert "0 runs to start, 2 finished already" in capfd.readouterr().out
     assert main(["report", "results", "-o", "docs"]) == 0
     report = (workplace / "docs" / "report.md").read_text()
     assert "| data set | recorded; best tenth | BC | DT | DTFM |" in report
@@ -357,14 +357,14 @@ def test_a_mistake_in_an_entry_is_told_with_its_file_its_name_and_its_key(entry,
 def test_the_first_seed_of_everything_comes_first(grid, monkeypatch):
     options = parse_arguments([*grid[1:], "--seeds", "0", "1"])
     jobs, done = plan(options)
-    assert [(job.cell.seed, job.cell.regime, job.cell.algo) for job in jobs] == [
+    assert [(job.key.seed, job.key.regime, job.key.algo) for job in jobs] == [
         (seed, regime, algo) for seed in (0, 1) for regime in (1.0, 0.5) for algo in ("dt", "dtfm")
     ]
     assert {json.dumps(job.data) for job in jobs} == {json.dumps(jobs[0].data)}
     assert done == []
 
 
-def test_a_file_of_other_rows_is_not_taken_for_the_cell(grid, workplace, row):
+def test_a_file_of_other_rows_is_not_taken_for_the_run(grid, workplace, row):
     """Two labels can become the same file name."""
     (workplace / "results").mkdir()
     other = {**row, "task": TASK, "algo": "dt", "profile": "tiny", "label": "a b"}
@@ -373,7 +373,7 @@ def test_a_file_of_other_rows_is_not_taken_for_the_cell(grid, workplace, row):
         plan(parse_arguments([*grid[1:], "--label", "a-b"]))
 
 
-def test_algorithms_with_different_trunks_are_refused(grid, workplace):
+def test_algorithms_with_different_transformers_are_refused(grid, workplace):
     folder = workplace / "profile"
     folder.mkdir()
     for algo, width in (("dt", 16), ("dtfm", 32)):
@@ -417,8 +417,8 @@ def test_a_mistake_ends_in_one_clear_line_before_anything_runs(arguments, messag
 
 
 @pytest.mark.slow
-def test_an_interrupted_cell_goes_on_from_its_checkpoint_to_the_same_rows(grid, workplace, monkeypatch):
-    """A cell loses nothing that a checkpoint holds."""
+def test_an_interrupted_run_goes_on_from_its_checkpoint_to_the_same_rows(grid, workplace, monkeypatch):
+    """A run loses nothing that a checkpoint holds."""
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
     grid += ["--fractions", "0.5", "--algo", "dtfm"]
     ends = {"tests.zoo.test_resuming.SignalAt": {"step": 3, "number": int(signal.SIGTERM)}}

@@ -22,7 +22,7 @@ from sb3_dtfm.benchmark.report.runs import (
     steps_to_success,
 )
 from sb3_dtfm.benchmark.results import summarize
-from sb3_dtfm.benchmark.rows import Cell, Row, write_row
+from sb3_dtfm.benchmark.rows import Row, RunKey, write_row
 from sb3_dtfm.cli.main import main
 from tests.benchmark.conftest import make_row
 
@@ -42,10 +42,10 @@ def table_row(text: str, *start: str) -> list[list[str]]:
     return [line[len(start) :] for line in lines if line[: len(start)] == list(start)]
 
 
-def test_labels_are_told_apart_and_unfinished_cells_left_out():
+def test_labels_are_told_apart_and_unfinished_runs_left_out():
     (study,) = read_studies([ROWS])
     assert [group.title for group in study.groups] == ["small", "small, ema"]
-    assert study.unfinished == [Cell(CHEETAH, 1.0, "dt", 0, "small")]
+    assert study.unfinished == [RunKey(CHEETAH, 1.0, "dt", 0, "small")]
 
 
 def test_late_best_and_final_are_those_of_each_run(groups):
@@ -173,7 +173,7 @@ def test_the_interval_of_success_is_the_wider_one_of_seeds_and_episodes():
     def run(seed: int, n_successes: int) -> Run:
         successes = [i < n_successes for i in range(10)]
         row = make_row(seed=seed, returns=[0.0] * 10, lengths=[1] * 10, successes=successes)
-        return Run(Cell.of(row), [], summarize(row))
+        return Run(RunKey.of(row), [], summarize(row))
 
     apart, alike = ([run(seed, n) for seed, n in enumerate(each)] for each in ((2, 9), (5, 5)))
     assert final_interval(apart) == pytest.approx((55.0, 0.0, 100.0))  # Student's t: 55 +- 445
@@ -215,9 +215,9 @@ def test_the_report_shows_what_was_run_and_what_was_not(tmp_path, capsys):
     assert time[-2:] == ["not reached", "not reached"]
     assert scores == ["0.38", "0.60", "0.50", "0.80", "10,000 (TQC: sampled actions)"]
     # DTFM wins all 6 pairs on Lift, and the one on HalfCheetah, which has one run of each
-    single = "(no interval: 1 cell has a single run)"
+    single = "(no interval: 1 combination has a single run)"
     assert table_row(text, "final evaluation")[0] == [f"0.67 {single}", f"1.00 {single}", f"1.00 {single}"]
-    assert "2 cells (task and share of the data) of 2 tasks, 7 runs" in text
+    assert "2 combinations of task and share of the data, 2 tasks, 7 runs" in text
     assert "Left out, as they have no final evaluation: HalfCheetah-v5, 100% of the data, dt, seed 0, small." in text
     assert "`local/halfcheetah/expert-v0`, 100 episodes, recorded from TQC: sampled actions" in text
     for figure in ("curves-small.png", "minutes-small.png", "solved-small.png"):
@@ -235,7 +235,7 @@ def test_nothing_is_said_of_scores_and_minutes_where_the_recorded_return_is_not_
     assert time[-2:] == ["-", "-"]
 
 
-def test_a_label_stands_beside_the_same_cell_without_it(tmp_path):
+def test_a_label_stands_beside_the_same_run_without_it(tmp_path):
     assert main(["report", str(ROWS), "-o", str(tmp_path)]) == 0
     settings = (
         "`ema_decay: 0.99` (not 0.999), `kv_cache: True`, `target_return: 9000.0` (not 12000.0), no `warmup_steps` (not 5)"
@@ -311,7 +311,7 @@ def write_suite(folder: Path, rows: Sequence[Row]) -> None:
 
 def test_a_score_goes_from_random_actions_to_the_best_tenth_of_what_was_recorded():
     (group,), _ = group_runs(map(summarize, SUITE))
-    scores = {(run.cell.task, run.cell.algo, run.cell.seed): run.score("final") for of in group.runs.values() for run in of}
+    scores = {(run.key.task, run.key.algo, run.key.seed): run.score("final") for of in group.runs.values() for run in of}
     # From -300 to 100; of four episodes one and two succeed, and half of the best tenth did
     assert scores == {
         ("hopper", "bc", 0): 0.75,
@@ -406,7 +406,7 @@ def test_a_baseline_is_drawn(tmp_path, monkeypatch):
     ("arguments", "message"),
     [
         (["nowhere"], "nowhere does not exist"),
-        (["."], "no finished cell"),
+        (["."], "no finished run"),
         (["bad.jsonl"], "bad.jsonl, line 1: is not JSON"),
         ([str(ROWS), "--baseline", "SAC"], "expected NAME=FILE or TASK:NAME=FILE"),
         ([str(ROWS), "--baseline", "SAC=nowhere.npz"], "nowhere.npz does not exist"),

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sb3_dtfm.benchmark.results import COLUMNS, read_results, read_table, result_files, summarize, write_results
-from sb3_dtfm.benchmark.rows import Cell, RowError, finished_cells, write_row
+from sb3_dtfm.benchmark.rows import RowError, RunKey, finished_runs, write_row
 from sb3_dtfm.cli.main import main
 from tests.benchmark.conftest import make_row
 
@@ -67,7 +67,7 @@ def test_files_of_several_machines_are_put_together(tmp_path):
     assert read_results([tmp_path]) == {"": expected}, "a row that is there twice counts once"
     write_results(tmp_path / "all.csv", expected)
     assert read_results([tmp_path / "a.jsonl", tmp_path / "all.csv"]) == {"": expected}, "in whatever form"
-    assert finished_cells(rows) == {Cell.of(row): 10 for row in rows}
+    assert finished_runs(rows) == {RunKey.of(row): 10 for row in rows}
 
 
 def test_a_folder_below_the_one_that_is_named_and_a_table_in_it_are_studies(tmp_path):

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from sb3_dtfm.benchmark.rows import KEYS, Cell, RowError, read_rows, write_row
+from sb3_dtfm.benchmark.rows import KEYS, RowError, RunKey, read_rows, write_row
 from tests.benchmark.conftest import make_row
 
 
@@ -69,10 +69,10 @@ def test_what_json_cannot_hold_is_not_written(tmp_path):
         write_row(tmp_path / "a.jsonl", make_row(returns=[float("nan")] * 4))
 
 
-def test_a_cells_file_name_has_no_separators():
-    cell = Cell("robosuite/Lift-v0", 0.5, "dt", 2, "small", "no ema")
-    assert cell.file_name == "robosuite-Lift-v0_0.5_dt_seed2_small_no-ema"
-    assert str(cell) == "robosuite/Lift-v0, 50% of the data, dt, seed 2, small, no ema"
+def test_a_runs_file_name_has_no_separators():
+    key = RunKey("robosuite/Lift-v0", 0.5, "dt", 2, "small", "no ema")
+    assert key.file_name == "robosuite-Lift-v0_0.5_dt_seed2_small_no-ema"
+    assert str(key) == "robosuite/Lift-v0, 50% of the data, dt, seed 2, small, no ema"
 
 
 def test_nan_in_a_file_is_refused(tmp_path, row):

@@ -61,7 +61,7 @@ def test_the_deviation_is_the_samples():
     assert mean_and_deviation([1.0, 3.0]) == pytest.approx((2.0, math.sqrt(2)))
 
 
-def test_interquartile_mean_leaves_out_both_ends_of_all_cells_together():
+def test_interquartile_mean_leaves_out_both_ends_of_all_combinations_together():
     assert interquartile_mean([np.array([1000.0, 1.0]), np.array([3.0, -1000.0])]) == 2.0
     # Of seven values a quarter, rounded down, is one at each end
     assert interquartile_mean([np.array([9.0, 1.0, 2.0]), np.array([3.0, 4.0, -9.0, 5.0])]) == 3.0
@@ -89,7 +89,7 @@ def test_the_bootstrap_draws_tasks_as_well_as_runs():
     assert bootstrap(overall_mean, ["a", "b"], scores) == (0.5, 0.0, 1.0)
 
 
-def test_cells_of_a_task_are_drawn_together():
+def test_combinations_of_a_task_are_drawn_together():
     # Half and full data of one task are no two tasks: whatever is drawn, both are there.
     scores = [np.zeros(3), np.ones(3)]
     assert bootstrap(overall_mean, ["a", "a"], scores) == (0.5, 0.5, 0.5)
@@ -123,7 +123,7 @@ def test_the_bootstrap_repeats():
     assert first.low <= first.estimate <= first.high
 
 
-def test_a_cell_of_a_single_run_leaves_no_interval():
+def test_a_combination_with_a_single_run_leaves_no_interval():
     scores, others = [np.array([1.0, 2.0]), np.array([3.0, 4.0])], [np.array([0.0]), np.array([1.0, 5.0])]
     assert (n_single_runs(scores, others), n_single_runs(others), n_single_runs(scores)) == (1, 1, 0)
     estimate, low, high = bootstrap(probability_of_improvement, ["a", "b"], scores, others)

@@ -11,7 +11,7 @@ from sb3_dtfm import DTFM
 from sb3_dtfm.cli.main import main
 from sb3_dtfm.data import load_dataset
 from sb3_dtfm.finetuning import FinetunedDTFM, OnlineDTFM
-from sb3_dtfm.zoo.arguments import asking_for
+from sb3_dtfm.zoo.arguments import with_target_return
 from tests.recorded import DATASET_ID, tiny_training
 
 EVALUATIONS = ["--eval-freq", "10", "--eval-episodes", "2"]
@@ -40,7 +40,7 @@ def run(workplace):
     ],
 )  # fmt: skip
 def test_another_target_leaves_the_other_wrappers(before, after):
-    assert asking_for(9.0, before) == after
+    assert with_target_return(9.0, before) == after
 
 
 def test_a_run_is_finetuned_and_played(run, workplace, capsys):
@@ -271,7 +271,7 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
     cases = {
         "--model nowhere": "nowhere does not exist; --model names a DTFM's zip file or its run's folder.",
         "--model logs/dt/HalfCheetah-v5_1": "was saved by 'DT', not by DTFM.",
-        "--model alone.zip": "--target-return R: needed, as alone.zip does not tell what return was asked for; "
+        "--model alone.zip": "--target-return R: needed, as alone.zip does not hold the target return of its training; "
         "`sb3-dtfm inspect DATASET` suggests one.",
         f"--model {run} --algo td3": "--algo td3: no packaged settings; those of dtfm, ppo, sac, tqc are.",
         "--model alone.zip --algo dtfm --target-return 3": "dataset:...: needed, as alone.zip does not tell what it learned",

@@ -81,7 +81,7 @@ def test_the_card_is_read_by_the_hub_and_its_code_loads_the_model(repository, mo
 def test_a_pulled_run_is_what_was_pushed_and_enjoy_takes_it(repository, pushed, capsys):
     for number in (1, 2):
         assert main(["pull", *MODEL, "--repo-folder", str(repository)]) == 0
-        assert f"Run: logs/dt/HalfCheetah-v5_{number} (asks for 50" in capsys.readouterr().out
+        assert f"Run: logs/dt/HalfCheetah-v5_{number} (target return 50" in capsys.readouterr().out
     enjoy = ["enjoy", "--algo", "dt", "--env", "HalfCheetah-v5", "--no-render", "-n", "40"]
     assert main(enjoy) == 0
     ours = capsys.readouterr().out.split("Episode Reward")[1:]

@@ -51,7 +51,7 @@ def test_every_fault_is_remarked():
         "There are 12 episodes: what is learned depends on which ones.",
         "There twice: 1 episode of 12.",
         "Neither terminated nor truncated, the recording just stops: 1 episode of 12.",
-        "No episode has any return, so that asking for one says nothing.",
+        "No episode has any return, so a target return has no effect.",
         "Observations never change in dimensions 1, 3.",
         "Actions never change in dimension 0.",
         "Actions use less than 10% of the action space's range in dimension 1: is it the range of these data?",
@@ -60,7 +60,7 @@ def test_every_fault_is_remarked():
     far["observations"][5, 2], far["actions"] = 1e6, np.sign(far["actions"])
     far["rewards"][:] = 1.0
     assert inspect_buffer(load_dataset(far)).remarks == [
-        "All returns are 4: the policy copies what it sees, whatever it is asked for.",
+        "All returns are 4: the policy copies what it sees, whatever its target return.",
         "Observations go far out in dimension 2: in 2, 110 standard deviations from the mean.",
         "100% of the actions are at a bound.",
     ]

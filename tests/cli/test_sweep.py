@@ -1,4 +1,4 @@
-"""Return asked for against return reached: real models, real episodes."""
+"""Target return against return reached: real models, real episodes."""
 
 import json
 import re
@@ -9,13 +9,13 @@ import pytest
 from matplotlib.figure import Figure
 
 from sb3_dtfm.cli.main import main
-from sb3_dtfm.cli.sweep import Asked, chance, distinguished, draw, evenly, finding, table
+from sb3_dtfm.cli.sweep import Reached, chance, distinguished, draw, evenly, finding, table
 from tests.recorded import DATASET_ID, tiny_training
 
 SWEEP = ["--env", "HalfCheetah-v5", "--dataset", DATASET_ID, "--episodes", "2", "--env-kwargs", "max_episode_steps:20"]
 
 
-def test_two_models_are_asked_for_the_range_of_their_data(workplace, capsys):
+def test_two_models_get_target_returns_over_the_range_of_their_data(workplace, capsys):
     for algo in ("dt", "dtfm"):
         assert main([*tiny_training(algo), "--dataset", DATASET_ID, "--eval-freq", "-1", "--target-return", "5"]) == 0
     capsys.readouterr()
@@ -23,7 +23,7 @@ def test_two_models_are_asked_for_the_range_of_their_data(workplace, capsys):
     assert main(["sweep", *runs, *SWEEP, "--points", "3", "-o", "figures/sweep.png"]) == 0
     text = capsys.readouterr().out
     header, _, *rows = [line for line in text.splitlines() if line.startswith("|")]
-    assert header == "| asked | DT, HalfCheetah-v5_1 | DTFM, HalfCheetah-v5 |"
+    assert header == "| target return | DT, HalfCheetah-v5_1 | DTFM, HalfCheetah-v5 |"
     assert len(rows) == 3
     assert all(re.fullmatch(r"\| -?[\d.]+ \|( -?[\d.]+ \[-?[\d.]+, -?[\d.]+\] \|){2}", row) for row in rows)
     found = [line for line in text.splitlines() if line.startswith("- ")]
@@ -42,7 +42,7 @@ def test_two_models_are_asked_for_the_range_of_their_data(workplace, capsys):
     twice = ["model.zip", "model.zip", "--algo", "dtfm"]
     assert main(["sweep", *twice, *SWEEP, "--returns", "1", "2", "-o", "figures/again.png"]) == 0
     header, _, *rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
-    assert header == "| asked | 1: model.zip | 2: model.zip |"
+    assert header == "| target return | 1: model.zip | 2: model.zip |"
     assert [row.split("|")[1].strip() for row in rows] == ["1", "2"]
     assert all(first == second for _, _, first, second, _ in (row.split("|") for row in rows))
     assert json.loads((workplace / "figures" / "again.json").read_text())["acting"] == {}
@@ -96,8 +96,8 @@ def test_the_table_and_the_picture_say_what_was_reached(tmp_path, monkeypatch):
         Figure, "savefig", lambda figure, *args, **kwargs: drawn.append(figure) or save(figure, *args, **kwargs)
     )
     curves = {
-        "DT": [Asked(1.0, [1.0, 3.0]), Asked(5.0, [4.0, 4.0])],
-        "DTFM": [Asked(1.0, [1.0, 1.0]), Asked(5.0, [5.0, 5.0], [True, False])],
+        "DT": [Reached(1.0, [1.0, 3.0]), Reached(5.0, [4.0, 4.0])],
+        "DTFM": [Reached(1.0, [1.0, 1.0]), Reached(5.0, [5.0, 5.0], [True, False])],
     }
     assert table(curves)[2:] == ["| 1 | 2 [-10.7062, 14.7062] | 1 |", "| 5 | 4 | 5, 1 of 2 solved |"]
     draw(curves, np.array([0.0, 1.0, 5.0]), tmp_path / "sweep.png", "HalfCheetah-v5")
@@ -107,19 +107,19 @@ def test_the_table_and_the_picture_say_what_was_reached(tmp_path, monkeypatch):
     assert [text.get_text() for text in drawn[0].axes[0].get_legend().get_texts()] == ["target return", "DT", "DTFM"]
 
 
-def asked(effect: float, n_episodes: int = 10, seed: int = 0, successes=None) -> list[Asked]:
-    """A model whose return is the episode's start, of a standard deviation of 100, and a share of what it is asked for."""
+def asked(effect: float, n_episodes: int = 10, seed: int = 0, successes=None) -> list[Reached]:
+    """A model whose return is the episode's start, of a standard deviation of 100, and a share of its target return."""
     starts = 100.0 * np.random.default_rng(seed).normal(size=n_episodes)
     targets = [500.0, 1000.0, 2000.0, 3700.0]
     told = [None] * len(targets) if successes is None else successes
-    return [Asked(target, (starts + effect * target).tolist(), each) for target, each in zip(targets, told, strict=True)]
+    return [Reached(target, (starts + effect * target).tolist(), each) for target, each in zip(targets, told, strict=True)]
 
 
-def test_a_model_that_follows_what_it_is_asked_for_is_told_what_is_best():
-    assert re.fullmatch(r"Asked for 3700 it did best: it returned [\d,.]+ on average\.", finding(asked(1.0)))
-    assert "Asked for 500 it did best" in finding(asked(-1.0))
+def test_a_model_that_follows_its_target_return_is_told_the_best():
+    assert re.fullmatch(r"The best target return is 3700: it returned [\d,.]+ on average\.", finding(asked(1.0)))
+    assert "The best target return is 500" in finding(asked(-1.0))
     solved = [[True] * n + [False] * (10 - n) for n in (1, 9, 2, 3)]
-    assert "Asked for 1000 it did best" in finding(asked(1.0, successes=solved)), "a success counts more than a return"
+    assert "The best target return is 1000" in finding(asked(1.0, successes=solved)), "a success counts more than a return"
     assert finding(asked(1.0, successes=solved)).endswith("and solved 9 of 10.")
 
 
@@ -127,13 +127,13 @@ def test_a_model_that_follows_what_it_is_asked_for_is_told_what_is_best():
 def test_a_model_that_follows_by_less_than_episodes_differ_copies(effect):
     """Even where each episode changes a little in the same direction, as deterministic acting from the same start does."""
     assert finding(asked(effect)) == (
-        "Asking for 500 to 3,700 changes the return by less than its spread between episodes: "
-        "this model copies the data whatever it is asked for."
+        "A target return of 500 to 3,700 changes the return by less than its spread between episodes: "
+        "this model copies the data whatever its target return."
     )
 
 
 def test_few_episodes_say_nothing():
-    more = "It takes more episodes to tell whether asking for 500 to 3,700 changes the return: --episodes 20."
+    more = "It takes more episodes to tell whether a target return of 500 to 3,700 changes the return: --episodes 20."
     assert [finding(asked(0.0, n)) for n in (1, 5)] == [more, more]
 
 

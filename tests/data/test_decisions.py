@@ -16,7 +16,7 @@ SPACE = spaces.Box(-1.0, 1.0, (2,))
 def make_buffer(kind: str, n_episodes: int = 20, n_steps: int = 40) -> TrajectoryBuffer:
     """
     Observations that jump about, and rewards that differ between episodes. An agent's action is a function of what it sees;
-    of several agents ("ladder") the better ones act otherwise; a planner's goes on as it began, whatever it sees.
+    of several agents ("several agents") the better ones act otherwise; a planner's goes on as it began, whatever it sees.
     """
     random = np.random.default_rng(0)
     episodes = []
@@ -25,7 +25,7 @@ def make_buffer(kind: str, n_episodes: int = 20, n_steps: int = 40) -> Trajector
         answers = np.tanh(observations[:, :2]) + random.normal(0.0, 0.05, (n_steps, 2))
         better = answers * (1.0 - 1.5 * number / n_episodes)
         plan = random.uniform(-0.8, 0.8, 2) + np.cumsum(random.normal(0.0, 0.02, (n_steps, 2)), axis=0)
-        acted = {"agent": answers, "ladder": better, "planner": plan}[kind]
+        acted = {"agent": answers, "several agents": better, "planner": plan}[kind]
         actions = np.clip(acted, -1.0, 1.0).astype(np.float32)
         rewards = np.full(n_steps, 1.0 + number / n_episodes)
         episodes.append(Trajectory(observations, actions, rewards, truncated=True))
@@ -75,7 +75,7 @@ def test_too_little_to_tell_is_taken_for_an_agents(n_episodes, n_steps):
     assert any("too few episodes" in sentence for sentence in sentences(decide(buffer)))
 
 
-@pytest.mark.parametrize(("kind", "expected"), [("ladder", (True, 5.0, 50)), ("agent", (False, 0.0, None))])
+@pytest.mark.parametrize(("kind", "expected"), [("several agents", (True, 5.0, 50)), ("agent", (False, 0.0, None))])
 def test_returns_count_where_they_tell_how_an_episode_acts(kind, expected):
     decided = settings(make_buffer(kind))
     assert (
@@ -84,14 +84,14 @@ def test_returns_count_where_they_tell_how_an_episode_acts(kind, expected):
 
 
 def test_returns_are_not_expected_where_a_reward_tells_of_success_alone():
-    buffer = make_buffer("ladder")
+    buffer = make_buffer("several agents")
     buffer.rewards[buffer.timesteps < 39] = 0.0
     decided = settings(buffer)
     assert (decided["expected_return_steps"], decided["return_range"]) == (0, False)
 
 
 def test_returns_that_are_all_alike_tell_nothing():
-    buffer = make_buffer("ladder")
+    buffer = make_buffer("several agents")
     buffer.episodes.returns[:] = 1.0
     assert prediction_errors(buffer).gain_by_return() == 0.0
 

@@ -62,7 +62,7 @@ def test_bounds_tell_the_choices_where_there_is_no_environment(kind, tmp_path):
     dataset = KINDS[kind](tmp_path)
     check(load_dataset(dataset, action_bounds=(-1, 1)))
     check(load_dataset(dataset, action_bounds=(-2, 1)), space=spaces.Discrete(4, start=-2))
-    with pytest.raises(DatasetError, match=r"nobody says how many there are: .*action_bounds=\(first, last\)"):
+    with pytest.raises(DatasetError, match=r"expected their number, too: .*action_bounds=\(first, last\)"):
         load_dataset(dataset)
     for bounds in ((-1, 0.5), (-1,), (1, 1), (0, 1e300), ([-1, -1], 1)):
         with pytest.raises(DatasetError, match="smallest and largest action are expected, whole numbers"):

@@ -77,11 +77,13 @@ def test_return_to_go_falls_by_each_reward_in_float64():
 
 
 @pytest.mark.parametrize(("target", "shown"), [(1.0, [1.0, 0.9, 0.8, 0.7]), (-2.0, [-2.0, -1.5, -1.0, -0.5])])
-def test_an_episode_ahead_of_its_target_keeps_the_targets_pace(target: float, shown: list[float]):
+def test_the_return_to_go_of_an_episode_ahead_of_its_target_is_bounded(target: float, shown: list[float]):
     """Each step's reward is 0.1, of 4 steps: behind a target of 1, and ahead of one of -2."""
-    for keep_pace, expected in ((True, shown), (False, [target - 0.1 * t for t in range(4)])):
+    for bound_return_to_go, expected in ((True, shown), (False, [target - 0.1 * t for t in range(4)])):
         gym.register("Constant-v0", constant_env, max_episode_steps=4)
-        env = ReturnToGoWrapper(gym.make("Constant-v0", disable_env_checker=True), target, keep_pace=keep_pace)
+        env = ReturnToGoWrapper(
+            gym.make("Constant-v0", disable_env_checker=True), target, bound_return_to_go=bound_return_to_go
+        )
         observations = [env.reset(seed=0)[0], *(env.step(np.zeros(1, np.float32))[0] for _ in range(3))]
         assert [each["return_to_go"].item() for each in observations] == pytest.approx(expected)
         gym.registry.pop("Constant-v0")
@@ -204,7 +206,7 @@ def test_replaying_a_recording_shows_exactly_the_return_to_go_of_the_buffer(
     )
     buffer = load_minari(dataset)
     episodes = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
-    env = ReturnToGoWrapper(gym.make(dataset.env_spec), 0.0, keep_pace=False)
+    env = ReturnToGoWrapper(gym.make(dataset.env_spec), 0.0, bound_return_to_go=False)
     row = 0
     for index, length in enumerate(buffer.episode_lengths):
         env.set_target_return(buffer.episode_returns[index])

@@ -1,4 +1,4 @@
-"""What the trunk may see, and that padding changes nothing."""
+"""Which steps the Transformer may see, and that padding changes nothing."""
 
 import pytest
 import torch as th

@@ -220,7 +220,7 @@ def test_what_chooses_by_value_is_not_exported(cheetah_buffer, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_trunk_and_flow_learn_as_without(cheetah_buffer):
+def test_transformer_and_flow_learn_as_without(cheetah_buffer):
     plain, critic = (
         make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=n, chunk_size=3)).learn(5) for n in (0, 2)
     )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sb3_dtfm.benchmark.report.runs import read_studies
-from sb3_dtfm.benchmark.rows import Cell, read_rows, write_row
+from sb3_dtfm.benchmark.rows import RunKey, read_rows, write_row
 from sb3_dtfm.cli.main import main
 from tests.benchmark.conftest import make_row
 from tests.recorded import DATASET_ID, tiny_training
@@ -20,8 +20,8 @@ def test_a_run_is_measured_and_shown(workplace):
     command = ["finetune", "--algo", "dtfm", "--env", "HalfCheetah-v5", "--model", str(before), "-n", "80", *settings]
     evaluated = ["--eval-freq", "40", "--eval-episodes", "3", "--eval-env-kwargs", "max_episode_steps:22"]
     assert main([*command, *evaluated]) == 0
-    cell = Cell("HalfCheetah-v5", 1.0, "dtfm", 0, "tiny")
-    like = dict(cell._asdict(), settings={"batch_size": 4}, data={"n_episodes": 3}, flow_solver="euler", flow_steps=1)
+    key = RunKey("HalfCheetah-v5", 1.0, "dtfm", 0, "tiny")
+    like = dict(key._asdict(), settings={"batch_size": 4}, data={"n_episodes": 3}, flow_solver="euler", flow_steps=1)
     (workplace / "rows").mkdir()
     run = workplace / "logs/dtfm/HalfCheetah-v5_2"
     shutil.copy(before / "HalfCheetah-v5.zip", run / "best_model.zip")  # one that is known not to be the last
@@ -42,7 +42,7 @@ def test_a_run_is_measured_and_shown(workplace):
     assert before.final["mean_return"] != after.final["mean_return"]
     assert after.final["settings"]["gradient_steps"] == 2
     assert after.final["settings"]["policy_kwargs"]["embed_dim"] == 16  # of the model before
-    rows = read_rows(workplace / "rows" / f"{cell._replace(label='own').file_name}.jsonl")
+    rows = read_rows(workplace / "rows" / f"{key._replace(label='own').file_name}.jsonl")
     seconds = np.array([row["wall_s"] for row in rows])
     assert seconds[0] == 0.0
     assert (np.diff(seconds) >= 0).all()
@@ -67,11 +67,11 @@ def test_a_noise_space_run_is_measured_where_its_decisions_are_steps(workplace):
         command = ["finetune", "--algo", "sac", "--env", "HalfCheetah-v5", "--model", str(before), "-n", "40", *quick]
         assert main([*command, "--eval-freq", "20", "--eval-episodes", "3"]) == 0
     (workplace / "rows").mkdir()
-    cell = Cell("HalfCheetah-v5", 1.0, "dtfm", 0, "tiny")
-    like = dict(cell._asdict(), settings={"batch_size": 4}, data={"n_episodes": 3}, flow_solver="euler", flow_steps=1)
+    key = RunKey("HalfCheetah-v5", 1.0, "dtfm", 0, "tiny")
+    like = dict(key._asdict(), settings={"batch_size": 4}, data={"n_episodes": 3}, flow_solver="euler", flow_steps=1)
     finetuned = workplace / "logs/finetuned"
     finetuning.measure(finetuned / "HalfCheetah-v5_1", before, like, "finetuned", workplace / "rows")
-    rows = read_rows(workplace / "rows" / f"{cell._replace(label='finetuned').file_name}.jsonl")
+    rows = read_rows(workplace / "rows" / f"{key._replace(label='finetuned').file_name}.jsonl")
     assert [row["step"] for row in rows] == [0, 20, 40, 40]
     assert rows[-1]["settings"]["noise_env"]["algorithm"] == "sac"
     with pytest.raises(SystemExit, match="its timesteps are decisions of several actions"):
@@ -86,7 +86,7 @@ def test_rollouts_are_shown_by_the_steps_they_took(tmp_path, monkeypatch):
         row = {**like, "task": task, "seed": seed, "label": label}
         row.update(data={**like["data"], "n_steps": n_steps}, returns=[0.0] * 4, lengths=[9] * 4)
         row["successes"] = [True] * n + [False] * (4 - n)
-        write_row(tmp_path / f"{Cell.of(row).file_name}.jsonl", row)
+        write_row(tmp_path / f"{RunKey.of(row).file_name}.jsonl", row)
     shown = {axes.get_title(): axes for axes in finetuning.plot_rollouts(tmp_path).axes}
     assert [line.get_ydata().tolist() for line in shown["Lift"].lines] == [[25, 50], [0, 100], [12.5, 75]]
     assert [line.get_ydata().tolist() for line in shown["Can"].lines] == [[75, 75], [25, 100], [50, 87.5]]

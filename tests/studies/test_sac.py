@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_dtfm.benchmark.rows import Cell, read_rows, write_row
+from sb3_dtfm.benchmark.rows import RunKey, read_rows, write_row
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 
 
@@ -38,12 +38,12 @@ def test_recorded_steps_lie_in_the_replay_buffer():
 
 @pytest.mark.slow
 def test_a_run_is_evaluated(tmp_path, monkeypatch):
-    cell = Cell("Pendulum-v1", 1.0, "dtfm", 3, "tiny")
+    key = RunKey("Pendulum-v1", 1.0, "dtfm", 3, "tiny")
     about = dict(
         settings={"dataset": "none"}, data={}, flow_solver="euler", flow_steps=1, commit=None, versions={}, hardware={}
     )
     episodes = dict(returns=[0.0], lengths=[200], successes=None, step=0, final=True, wall_s=0.0, steps_per_s=0.0)
-    write_row(tmp_path / "like.jsonl", {**cell._asdict(), **about, **episodes})
+    write_row(tmp_path / "like.jsonl", {**key._asdict(), **about, **episodes})
     monkeypatch.setattr(sac, "N_FINAL_EPISODES", 4)
     arguments = ["--like", str(tmp_path / "like.jsonl"), "-n", "40", "--eval-freq", "20", "--eval-episodes", "2"]
     monkeypatch.setattr(sys, "argv", ["sac.py", *arguments, "--output", str(tmp_path / "rows")])

@@ -36,7 +36,7 @@ def train(settings: dict, *arguments: str) -> int:
 def test_the_run_of_an_entry_without_a_target_return_has_one(settings, before, workplace, capsys):
     suggested = suggested_target_return(load_dataset(DATASET_ID, max_episode_steps=20))
     assert train(settings, "--eval-freq", "-1") == 0
-    assert f"The environment asks for target_return={suggested:g}, as `sb3-dtfm inspect` suggests" in capsys.readouterr().out
+    assert f"The environment has target_return={suggested:g}, as `sb3-dtfm inspect` suggests" in capsys.readouterr().out
     assert read_run(workplace / RUN / "HalfCheetah-v5")["env_wrapper"] == [*before, {WRAPPER: {"target_return": suggested}}]
     assert main(ENJOY) == 0
     assert f"target return {four_digits(suggested)}, reached" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""What all demonstrators share: a manner, the way to the object, the grasp, and an unsteady hand."""
+"""Base of all demonstrators: a manner, the way to the object, the grasp, and an unsteady hand."""
 
 import numpy as np
 
@@ -140,7 +140,7 @@ class Demonstrator:
         return self.stage
 
     def _target(self, hand: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, float]:
-        """Where the hand should go, (3,) metres, and the gripper's command."""
+        """Goal of the hand, (3,) metres, and the gripper's command."""
         grasp_point = self._grasp_point(position)
         aside = float(np.hypot(*(grasp_point - hand)[:2]))
         if self.stage == "hover":

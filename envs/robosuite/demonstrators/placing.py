@@ -15,7 +15,7 @@ class PlacingDemonstrator(Demonstrator):
     reach = 0.07  # metres from the hand to the object: further away, it is lost
 
     def _place(self) -> np.ndarray:
-        """Where the object belongs, (2,) metres."""
+        """Goal of the object, (2,) metres."""
         raise NotImplementedError
 
     def _after_carry(self) -> str:

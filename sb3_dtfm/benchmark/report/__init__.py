@@ -1,1 +1,1 @@
-"""What results say: statistics, tables and figures. Nothing here needs a simulator, or what made the rows."""
+"""Reports of results: statistics, tables and figures. Nothing here needs a simulator, or what made the rows."""

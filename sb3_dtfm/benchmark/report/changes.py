@@ -1,11 +1,11 @@
-"""What `--label`s changed: the settings that differ from the profile's own, and what became of the results."""
+"""Changes of `--label`s: the settings that differ from the profile's own, and what became of the results."""
 
 from collections.abc import Sequence
 from typing import Any
 
 from sb3_dtfm.benchmark.report.runs import Group, Run, Study
 
-# Settings that tell cells apart, not labels.
+# Settings that tell runs apart, not labels.
 NOT_A_CHANGE = ("dataset", "dataset_fraction", "dataset_seed", "fraction", "fraction_seed")
 
 
@@ -59,13 +59,13 @@ def _flat(settings: dict[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def compared_cells(base: Group, changed: Group) -> list[tuple[str, float, str, list[Run], list[Run]]]:
+def compared_runs(base: Group, changed: Group) -> list[tuple[str, float, str, list[Run], list[Run]]]:
     """
-    The cells of a labelled group beside those without a label.
+    The runs of a labelled group beside those without a label.
 
     :return: task, share of the data, algorithm, the labelled runs, and the others with the same seeds
     """
     return [
-        (*key, runs, [run for run in base.of(*key) if run.cell.seed in {each.cell.seed for each in runs}])
+        (*key, runs, [run for run in base.of(*key) if run.key.seed in {each.key.seed for each in runs}])
         for key, runs in sorted(changed.runs.items(), key=lambda item: item[0])
     ]

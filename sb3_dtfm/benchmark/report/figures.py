@@ -98,7 +98,7 @@ def plot_group(
     group: Group, output: Path, x: str = "steps", baselines: Sequence[Baseline] = (), agent_line: bool = True
 ) -> Path:
     """
-    Draw the learning curves of all cells of a group.
+    Draw the learning curves of all runs of a group.
 
     :param group: the runs
     :param output: PNG file to write

@@ -1,4 +1,4 @@
-"""From results to runs: what each training run achieved, and how runs of a cell are summed up."""
+"""From results to runs: what each training run achieved, and how runs of several seeds are summed up."""
 
 import math
 import os
@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_dtfm.benchmark.report.statistics import Interval, mean_and_deviation, student_t, t_interval, wilson
 from sb3_dtfm.benchmark.results import Result, read_results
-from sb3_dtfm.benchmark.rows import BASELINES, Cell
+from sb3_dtfm.benchmark.rows import BASELINES, RunKey
 
 # The paper's comparison, which is shown whether it was run or not.
 PAPER_ALGORITHMS = ("dt", "dtfm")
@@ -25,12 +25,12 @@ class Run(NamedTuple):
     """
     One training run.
 
-    :param cell: what it is known by
+    :param key: what it is known by
     :param evaluations: results of the evaluations before and during training, by gradient step
     :param final: result of the final evaluation
     """
 
-    cell: Cell
+    key: RunKey
     evaluations: list[Result]
     final: Result
 
@@ -78,14 +78,14 @@ class Run(NamedTuple):
 
     @property
     def zero(self) -> float:
-        """What scores 0: no success, or the mean return of random actions; a return of 0 where that is not known."""
+        """Reference of score 0: no success, or the mean return of random actions; a return of 0 where that is not known."""
         return float(self.final["data"]["random_return"]) if self.knows_random else 0.0
 
     @property
     def scale(self) -> float | None:
         """
-        What scores 1: the successes of the best tenth of the recorded episodes, in percent, or 100 where the data do not
-        tell; the mean return of the best tenth, or of all where that of random actions is not known.
+        Reference of score 1: the successes of the best tenth of the recorded episodes, in percent, or 100 if unknown;
+        without successes the mean return of the best tenth, or of all where that of random actions is not known.
 
         :return: None where that is not known, or not above what scores 0
         """
@@ -211,7 +211,7 @@ class Group(NamedTuple):
         return [task for task in self.tasks if (runs := self.of_task(task)) and all(run.counts_success for run in runs)]
 
     def of(self, task: str, regime: float, algo: str) -> list[Run]:
-        """Runs of one cell, none if it was not run."""
+        """Runs of all seeds, none if there was no run."""
         return self.runs.get((task, regime, algo), [])
 
     def of_task(self, task: str) -> list[Run]:
@@ -221,16 +221,16 @@ class Group(NamedTuple):
 
 class Study(NamedTuple):
     """
-    What one folder or table of results holds.
+    Content of one folder or table of results.
 
     :param name: of the folder or table, "" for what was named itself
     :param groups: its runs by profile and label
-    :param unfinished: cells left out because they have no final evaluation
+    :param unfinished: runs left out because they have no final evaluation
     """
 
     name: str
     groups: list[Group]
-    unfinished: list[Cell]
+    unfinished: list[RunKey]
 
 
 def read_studies(paths: Iterable[str | os.PathLike[str]], tasks: Sequence[str] = ()) -> list[Study]:
@@ -247,7 +247,7 @@ def read_studies(paths: Iterable[str | os.PathLike[str]], tasks: Sequence[str] =
 
 
 def full_name(algo: str) -> str:
-    """What figures and tables call an algorithm where there is room."""
+    """Long name of an algorithm in figures and tables."""
     return {"bc-best": "BC of the best tenth"}.get(algo, algo.upper())
 
 
@@ -257,27 +257,27 @@ def row_value(result: Result) -> float:
     return float(result["mean_return"]) if successes is None else 100.0 * (successes / result["n_episodes"])
 
 
-def group_runs(results: Iterable[Result], tasks: Sequence[str] = ()) -> tuple[list[Group], list[Cell]]:
+def group_runs(results: Iterable[Result], tasks: Sequence[str] = ()) -> tuple[list[Group], list[RunKey]]:
     """
     Runs by profile and label.
 
     :param results: in any order
     :param tasks: shown first and in this order; run or not, where there is no label
-    :return: the groups, and cells left out because they have no final evaluation
+    :return: the groups, and runs left out because they have no final evaluation
     """
-    evaluations: dict[Cell, list[Result]] = {}
-    finals: dict[Cell, Result] = {}
+    evaluations: dict[RunKey, list[Result]] = {}
+    finals: dict[RunKey, Result] = {}
     for result in sorted(results, key=lambda result: int(result["step"])):
-        during = evaluations.setdefault(Cell.of(result), [])
+        during = evaluations.setdefault(RunKey.of(result), [])
         if result["final"]:
-            finals[Cell.of(result)] = result
+            finals[RunKey.of(result)] = result
         else:
             during.append(result)
     groups: dict[tuple[str, str], Group] = {}
-    for cell in sorted(finals):
-        group = groups.setdefault((cell.profile, cell.label), Group(cell.profile, cell.label, [], {}))
-        group.tasks.append(cell.task)
-        group.runs.setdefault((cell.task, cell.regime, cell.algo), []).append(Run(cell, evaluations[cell], finals[cell]))
+    for key in sorted(finals):
+        group = groups.setdefault((key.profile, key.label), Group(key.profile, key.label, [], {}))
+        group.tasks.append(key.task)
+        group.runs.setdefault((key.task, key.regime, key.algo), []).append(Run(key, evaluations[key], finals[key]))
     for group in groups.values():
         # What was changed for a label may not be meant for all tasks.
         first = [task for task in tasks if task in group.tasks] if group.label else tasks
@@ -366,7 +366,7 @@ def paired_scores(
     group: Group, algo: str, other: str, measure: str
 ) -> tuple[list[tuple[str, float]], list[np.ndarray], list[np.ndarray]]:
     """
-    Scores of the cells that two algorithms have run.
+    Scores of the tasks and shares that two algorithms have run.
 
     :return: task and regime of each, and the runs' scores of the first and of the second
     """

@@ -1,8 +1,8 @@
 """
 The statistics of a comparison: intervals, and the aggregates of Agarwal et al. (2021, https://arxiv.org/abs/2108.13264).
 
-Pure functions of numbers. Scores come as a list of arrays, one array of runs for each cell, which is a task and a share of
-its data: cells may have different numbers of runs.
+Pure functions of numbers. Scores come as a list of arrays, one array of runs for each combination of a task and a share
+of its data, which may have different numbers of runs.
 """
 
 import math
@@ -57,7 +57,7 @@ def mean_and_deviation(values: Sequence[float] | np.ndarray) -> tuple[float, flo
 
 
 def interquartile_mean(scores: Scores) -> float:
-    """Mean of the middle half of all runs of all cells: a quarter, rounded down, is left out at each end."""
+    """Mean of the middle half of all runs of all combinations: a quarter, rounded down, is left out at each end."""
     ordered = np.sort(np.concatenate(scores))
     n_cut = len(ordered) // 4
     return float(ordered[n_cut : len(ordered) - n_cut].mean())
@@ -65,10 +65,10 @@ def interquartile_mean(scores: Scores) -> float:
 
 def probability_of_improvement(scores: Scores, others: Scores) -> float:
     """
-    Probability that a run of the first algorithm beats one of the second, averaged over cells; a tie counts half.
+    Probability that a run of the first algorithm beats one of the second, averaged over combinations; a tie counts half.
 
-    :param scores: runs of the first algorithm, one array for each cell
-    :param others: runs of the second, the cells in the same order
+    :param scores: runs of the first algorithm, one array for each combination
+    :param others: runs of the second, the combinations in the same order
     """
     shares = []
     for mine, theirs in zip(scores, others, strict=True):
@@ -78,8 +78,8 @@ def probability_of_improvement(scores: Scores, others: Scores) -> float:
 
 
 def n_single_runs(*scores: Scores) -> int:
-    """Cells in which an algorithm has a single run: nobody knows how far another run would be from it."""
-    return sum(any(len(runs) < 2 for runs in cell) for cell in zip(*scores, strict=True))
+    """Combinations in which an algorithm has a single run, which tells no spread."""
+    return sum(any(len(runs) < 2 for runs in combination) for combination in zip(*scores, strict=True))
 
 
 def bootstrap(
@@ -88,25 +88,25 @@ def bootstrap(
     """
     Percentile interval of a statistic, for a claim about tasks like these and not about these alone.
 
-    Which tasks were chosen is chance as well. So tasks are drawn anew, each with all its cells since those are of a kind,
-    and then runs within each cell (the bootstrap over tasks and runs of Agarwal et al., 2021). It errs on the wide side: the
-    runs' own spread is in that of the tasks already. Of a single task it is the bootstrap over its runs, for it alone.
+    Which tasks were chosen is chance as well. So tasks are drawn anew, each with all its combinations since those are of a
+    kind, and then runs within each combination (the bootstrap over tasks and runs of Agarwal et al., 2021). It errs on the
+    wide side: the runs' own spread is in that of the tasks already. Of a single task it is the bootstrap over its runs.
 
     :param statistic: of as many lists of arrays as are given
-    :param tasks: of each cell
-    :param scores: for each algorithm, one array of runs for each cell
+    :param tasks: of each combination
+    :param scores: for each algorithm, one array of runs for each combination
     :param n_resamples: draws
     :param seed: of the draws
-    :return: estimate and limits; no limits where a cell has a single run, which would count as exact
+    :return: estimate and limits; no limits where a combination has a single run, which would count as exact
     """
     estimate = statistic(*scores)
     if n_single_runs(*scores):
         return Interval(estimate)
     generator = np.random.default_rng(seed)
-    cells = [[i for i, each in enumerate(tasks) if each == task] for task in dict.fromkeys(tasks)]
+    combinations = [[i for i, each in enumerate(tasks) if each == task] for task in dict.fromkeys(tasks)]
     draws = []
     for _ in range(n_resamples):
-        drawn = [i for task in generator.integers(len(cells), size=len(cells)) for i in cells[task]]
+        drawn = [i for task in generator.integers(len(combinations), size=len(combinations)) for i in combinations[task]]
         draws.append(
             statistic(*([runs[i][generator.integers(len(runs[i]), size=len(runs[i]))] for i in drawn] for runs in scores))
         )

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from sb3_dtfm.benchmark.report.changes import changed_settings, compared_cells, split_changes
+from sb3_dtfm.benchmark.report.changes import changed_settings, compared_runs, split_changes
 from sb3_dtfm.benchmark.report.runs import (
     MEASURES,
     N_LATE,
@@ -119,7 +119,7 @@ def _reached(runs: Sequence[Run]) -> str:
 
 
 def _recorded(run: Run) -> str:
-    """What the recorded episodes reached, and the best tenth of them."""
+    """Mean of the recorded episodes, and of the best tenth of them."""
     data = run.final["data"]
     if run.counts_success:
         shares = [data.get("success_rate"), data.get("best_success")]
@@ -132,7 +132,7 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     return [f"| {' | '.join(line)} |" for line in (header, ["---"] * len(header), *rows)]
 
 
-def _cell_table(
+def _task_table(
     group: Group,
     tasks: Sequence[str],
     columns: Mapping[str, Say],
@@ -162,7 +162,7 @@ def _achieved(group: Group) -> list[str]:
     )
     columns = _say_measures(*MEASURES)
     seeds = ("seeds", lambda runs: " / ".join(str(len(each)) for each in runs))
-    return [text, "", *_cell_table(group, group.tasks, columns, seeds)]
+    return [text, "", *_task_table(group, group.tasks, columns, seeds)]
 
 
 def _say_measures(*measures: str) -> dict[str, Say]:
@@ -197,7 +197,7 @@ def _intervals(group: Group) -> list[str]:
         "wider one of that and Wilson's over the episodes of all seeds."
     )
     columns = {MEASURES["late"]: _late, MEASURES["final"]: _final}
-    return [text, "", *_cell_table(group, group.tasks, columns)]
+    return [text, "", *_task_table(group, group.tasks, columns)]
 
 
 def _late(runs: Sequence[Run]) -> str:
@@ -227,7 +227,7 @@ def _bracket(interval: Interval, format_: Callable[[float], str], without: str =
 
 def _steps(group: Group) -> list[str]:
     """Table of how soon the median episode succeeds."""
-    return _cell_table(group, group.success_tasks, {"median steps to success": _median_steps})
+    return _task_table(group, group.success_tasks, {"median steps to success": _median_steps})
 
 
 def _median_steps(runs: Sequence[Run]) -> str:
@@ -247,7 +247,7 @@ def _scores(group: Group) -> list[str]:
         "whatever share was learned from). Mean over seeds."
     )
     columns = {MEASURES[measure]: lambda runs, measure=measure: _share(runs, measure) for measure in ("late", "final")}
-    return [text, "", *_cell_table(group, tasks, columns, ("1.00 is", _scale))]
+    return [text, "", *_task_table(group, tasks, columns, ("1.00 is", _scale))]
 
 
 def _share(runs: Sequence[Run], measure: str) -> str:
@@ -291,7 +291,7 @@ def _aggregates_of(group: Group, algo: str, base: str) -> list[str]:
         claim = "tasks like these, drawn anew with their runs" if len(set(tasks)) > 1 else "this task alone"
         text = (
             f"Aggregates of scores (success rate, or share of the recorded return) over what both have run: "
-            f"{_count(len(keys), 'cell')} (task and share of the data) of {_count(len(set(tasks)), 'task')}, "
+            f"{_count(len(keys), 'combination')} of task and share of the data, {_count(len(set(tasks)), 'task')}, "
             f"{_count(sum(map(len, [*scores, *others])), 'run')}. Interquartile mean, and probability that a run of "
             f"{algo.upper()} beats one of {base.upper()}; in brackets 95 % intervals for {claim} (Agarwal et al., 2021)."
         )
@@ -301,7 +301,7 @@ def _aggregates_of(group: Group, algo: str, base: str) -> list[str]:
 
 def _aggregate(tasks: Sequence[str], statistic: Callable[..., float], *scores: Sequence[np.ndarray]) -> str:
     n_single = n_single_runs(*scores)
-    without = f" (no interval: {_count(n_single, 'cell')} {'has' if n_single == 1 else 'have'} a single run)"
+    without = f" (no interval: {_count(n_single, 'combination')} {'has' if n_single == 1 else 'have'} a single run)"
     return _bracket(bootstrap(statistic, tasks, *scores), lambda value: f"{value:.2f}", without)
 
 
@@ -316,7 +316,7 @@ def _time(group: Group) -> list[str]:
         "steps/s": lambda runs: f"{np.mean([run.final['steps_per_s'] for run in runs]):.1f}",
         TO_THRESHOLD: _minutes_to_threshold,
     }
-    return [text, "", *_cell_table(group, group.tasks, columns)]
+    return [text, "", *_task_table(group, group.tasks, columns)]
 
 
 def _minutes(runs: Sequence[Run]) -> str:
@@ -341,7 +341,7 @@ def _changes(base: Group, labelled: Sequence[Group]) -> list[str]:
     }
     rows = []
     for group in labelled:
-        for task, regime, algo, runs, same in compared_cells(base, group):
+        for task, regime, algo, runs, same in compared_runs(base, group):
             settings = _escape(changed_settings(runs[0], base.of(task, regime, algo)))
             cells = [say(each) if each else NOT_RUN for say in columns.values() for each in (runs, same)]
             seeds = f"{len(runs)}; {len(same)} without" if same and len(same) != len(runs) else str(len(runs))

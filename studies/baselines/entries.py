@@ -13,7 +13,7 @@ import torch as th
 from baselines.process import BaselineProcess
 from sb3_dtfm.benchmark import provenance
 from sb3_dtfm.benchmark.evaluation import FINAL_STATES, evaluate, make_seeded_envs
-from sb3_dtfm.benchmark.rows import Cell, Row, read_rows
+from sb3_dtfm.benchmark.rows import Row, RunKey, read_rows
 from sb3_dtfm.benchmark.settings import Task, read_yaml, task_settings
 from sb3_dtfm.data import TrajectoryBuffer, load_dataset
 from sb3_dtfm.envs import known_task
@@ -34,7 +34,7 @@ class Data(NamedTuple):
     :param task: Gymnasium id
     :param kind: one of `KINDS`
     :param dataset: Minari id, robomimic file or flat arrays
-    :param target_return: asked for when acting, in reward units
+    :param target_return: when acting, in reward units
     :param minutes: of a baseline's training on one core
     :param fraction: share of the episodes to learn from
     :param n_timesteps: our gradient steps, None for the profile's
@@ -135,9 +135,9 @@ def read_entries(path: Path, entry: type[Any]) -> dict[str, Any]:
     return found
 
 
-def baseline_cell(data: Data, baseline: Baseline, seed: int, label: str = "") -> Cell:
+def baseline_key(data: Data, baseline: Baseline, seed: int, label: str = "") -> RunKey:
     """What a baseline's training on a dataset is known by."""
-    return Cell(data.task, data.fraction, baseline.name, seed, PROFILE, "-".join(filter(None, (data.name, label))))
+    return RunKey(data.task, data.fraction, baseline.name, seed, PROFILE, "-".join(filter(None, (data.name, label))))
 
 
 def export(data: Data, baseline: Baseline, path: Path, max_episode_steps: int | None) -> TrajectoryBuffer:
@@ -190,7 +190,7 @@ def row_settings(data: Data, baseline: Baseline, budget: Budget) -> dict[str, An
 
 def check_same(rows: Path, settings: dict[str, Any]) -> None:
     """
-    Refuse to take a finished cell for one of other settings.
+    Refuse to take a finished run for one of other settings.
 
     :raises UsageError: names what differs
     """
@@ -231,7 +231,7 @@ def run_baseline(
         episodes = evaluate(process, vec_env, seeds, lambda n: say(n_steps, n_steps, f"evaluation {n}/{len(seeds)}"))
         action_ms = process.action_ms()
     return {
-        **baseline_cell(data, baseline, seed, options.label)._asdict(),
+        **baseline_key(data, baseline, seed, options.label)._asdict(),
         "settings": row_settings(data, baseline, budget),
         "data": provenance.describe_data(provenance.read_data(data.task, data.settings()), data.dataset, data.recorded_from),
         "commit": provenance.commit(),
