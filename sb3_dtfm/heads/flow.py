@@ -142,8 +142,8 @@ class FlowHead(ActionHead):
     ) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         starts, tau = noise
         learned = hidden.detach() if self.options.regression_coef else hidden
-        drawn = (th.cat([each] * self.options.flow_draws) for each in (learned, actions, mask))
-        loss = self.flow_loss(*drawn, starts, tau)
+        hiddens, targets, masks = (th.cat([each] * self.options.flow_draws) for each in (learned, actions, mask))
+        loss = self.flow_loss(hiddens, targets, masks, starts, tau)
         parts = {"flow_loss": loss}
         if self.options.regression_coef:
             assert self.regression is not None
