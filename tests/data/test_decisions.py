@@ -154,7 +154,10 @@ def test_images_are_learned_in_small_batches_by_several_draws_each():
     random = np.random.default_rng(0)
     episodes = [
         {
-            "observations": {"camera": random.integers(0, 256, (20, 16, 16, 3), np.uint8), "gripper": random.random((20, 2))},
+            "observations": {
+                "camera": random.integers(0, 256, (20, 16, 16, 3), np.uint8),
+                "gripper": random.random((20, 2)),
+            },
             "actions": random.uniform(-1.0, 1.0, (20, 2)),
             "rewards": np.zeros(20),
             "terminated": True,
@@ -166,4 +169,6 @@ def test_images_are_learned_in_small_batches_by_several_draws_each():
     assert (model.batch_size, model.policy.network.head.options.flow_draws) == (64, 8)
     assert any("camera" in sentence and "flow_draws=8" in sentence for sentence in sentences(model.decisions))
     assert DTFM("MultiInputPolicy", dataset=episodes, batch_size=4, policy_kwargs=small).batch_size == 4
-    assert "flow_draws" not in {each.name for each in DT("MultiInputPolicy", dataset=episodes, policy_kwargs=small).decisions}
+    assert "flow_draws" not in {
+        each.name for each in DT("MultiInputPolicy", dataset=episodes, policy_kwargs=small).decisions
+    }
