@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import DatasetError, load_dataset
 from sb3_dtfm.envs import ReturnToGoWrapper
-from sb3_dtfm.policies.images import EXTRACTORS, ResidualExtractor, spatial_softmax
+from sb3_dtfm.policies.images import EXTRACTORS, N_CROPS, ResidualExtractor, spatial_softmax
 from tests.algorithms.small import make_model
 from tests.images import CAMERA, make_pixels, record
 
