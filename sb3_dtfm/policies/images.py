@@ -21,6 +21,9 @@ class ResidualExtractor(BaseFeaturesExtractor):
     A residual network with group normalisation and spatial softmax (Levine et al., 2016), which learns where things are on
     random crops, as in robomimic (Mandlekar et al., 2021) and Diffusion Policy (Chi et al., 2023). Acting crops the centre.
 
+    The first convolution strides by 4, as NatureCNN's: in the same seconds on a CPU, it locates objects of Push-T with half
+    of the error of a stride of 2.
+
     :param observation_space: Box (channels, height, width)
     :param features_dim: numbers that an image becomes
     :param channels: of the first convolution and of each residual block; all but the last block halve height and width
@@ -32,7 +35,7 @@ class ResidualExtractor(BaseFeaturesExtractor):
         self,
         observation_space: spaces.Box,
         features_dim: int = 64,
-        channels: tuple[int, ...] = (32, 32, 64, 64),
+        channels: tuple[int, ...] = (32, 64, 64),
         crop: float = 0.9,
     ) -> None:
         super().__init__(observation_space, features_dim)
@@ -40,7 +43,7 @@ class ResidualExtractor(BaseFeaturesExtractor):
             raise ValueError(f"crop must be a number in (0, 1] and channels two or more, got {crop!r} and {channels!r}.")
         n_channels, height, width = observation_space.shape
         self.size = (round(crop * height), round(crop * width))
-        self.stem = nn.Conv2d(n_channels, channels[0], kernel_size=5, stride=2, padding=2)
+        self.stem = nn.Conv2d(n_channels, channels[0], kernel_size=8, stride=4, padding=2)
         *pairs, last = itertools.pairwise(channels)
         blocks = [ResidualBlock(*pair, stride=2) for pair in pairs]
         self.blocks = nn.Sequential(*blocks, ResidualBlock(*last, stride=1))

@@ -12,7 +12,7 @@ from sb3_dtfm.policies.images import ImageEncoder
 from sb3_dtfm.windows import OBSERVATION, Windows
 
 # An image's, of 84 x 84 by the default extractor: convolutions keep all threads busy.
-N_MACS_OF_IMAGES = 25_000_000
+N_MACS_OF_IMAGES = 15_000_000
 HIDDEN_DIM = 256
 # The lower and the upper expectile: 0.5 would be the mean twice, 0 and 1 the extremes.
 EXPECTILES = (0.05, 0.95)
