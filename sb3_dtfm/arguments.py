@@ -6,7 +6,7 @@ import inspect
 import math
 import numbers
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -124,6 +124,15 @@ class Options:
         vars(self).update(check_arguments(vars(self), rules))
 
     @classmethod
+    def of(cls: "type[SelfOptions]", given: Mapping[str, Any]) -> "SelfOptions":
+        """
+        Options of these names, and defaults of the others.
+
+        :param given: values by name, also of other arguments
+        """
+        return cls(**{name: given[name] for name in cls.defaults() if name in given})
+
+    @classmethod
     def defaults(cls) -> dict[str, Any]:
         """All names with their defaults."""
         return {each.name: each.default for each in dataclasses.fields(cls)}
@@ -153,13 +162,14 @@ def with_nearest(names: Iterable[str], known: Iterable[str]) -> str:
     return ", ".join(name + (f" (did you mean {found[0]}?)" if found else "") for name, found in nearest.items())
 
 
-def documented_parameters(described: type, names: Collection[str] | None = None) -> str:
+def documented_parameters(*described: type, order: Iterable[str] = ()) -> str:
     """
-    The `:param` entries of a class's docstring.
+    The `:param` entries of classes' docstrings.
 
-    :param described: the class
-    :param names: of the parameters to take; None for all
+    :param described: the classes
+    :param order: of parameters; others follow
     """
-    text = inspect.cleandoc(described.__doc__ or "")
-    entries = re.findall(r"^:param (\w+):(.*?)(?=^:|\Z)", text, re.DOTALL | re.MULTILINE)
-    return "\n".join(f":param {name}:{about.rstrip()}" for name, about in entries if names is None or name in names)
+    text = "\n".join(inspect.cleandoc(each.__doc__ or "") for each in described)
+    found = dict(re.findall(r"^:param (\w+):(.*?)(?=^:|\Z)", text, re.DOTALL | re.MULTILINE))
+    names = [*(name for name in order if name in found), *found]
+    return "\n".join(f":param {name}:{found[name].rstrip()}" for name in dict.fromkeys(names))

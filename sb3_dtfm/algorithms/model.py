@@ -1,6 +1,5 @@
 """A model as Stable-Baselines3 knows it: a policy, environments that it acts in, and files that run no code."""
 
-import inspect
 import io
 from collections.abc import Iterable
 from importlib.metadata import version
@@ -14,32 +13,55 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, TensorDict
+from stable_baselines3.common.type_aliases import GymEnv, Schedule, TensorDict
 from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dtfm.actions import ActionSpace, same_actions
 from sb3_dtfm.algorithms.loading import SavedModel, check_policy, parameters, read_saved, wrap_file_errors
-from sb3_dtfm.algorithms.saving import OPTIMIZER, POLICY, optimizer_tensors, optimizers, to_configuration
-from sb3_dtfm.arguments import NOT_NEGATIVE, Rule, documented_parameters
+from sb3_dtfm.algorithms.options import TrainingOptions
+from sb3_dtfm.algorithms.saving import (
+    OPTIMIZER,
+    POLICY,
+    UnsavedSchedule,
+    optimizer_tensors,
+    optimizers,
+    to_configuration,
+)
+from sb3_dtfm.arguments import NOT_NEGATIVE, POSITIVE, Number, Rule, check_arguments
 from sb3_dtfm.data import DatasetError, ReturnReference, ScoreReference, TrajectoryBuffer, check_action_space
-from sb3_dtfm.distributed import is_first_process
+from sb3_dtfm.distributed import check_batch_size, is_first_process
 from sb3_dtfm.envs import ReturnToGoWrapper, check_vec_env, image_spaces, known_task, share_target_return
 from sb3_dtfm.files import ModelFile, ModelFileError, file_name, holds_pickles, read_model, write_model, write_onnx
+from sb3_dtfm.optimization import RunningMeans
 from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.policies.exported import ExportedPolicy
-from sb3_dtfm.policies.options import PolicyOptions
 
 # The names of an algorithm's one policy: Stable-Baselines3's for dictionaries, which it observes, for vectors and images.
 POLICY_NAMES = ("MultiInputPolicy", "MlpPolicy", "CnnPolicy")
+
+# Arguments of an algorithm, beside TrainingOptions, that are numbers.
+ACCEPTED: dict[str, Rule] = {
+    "seed": Number(low=0, whole=True, optional=True),
+    "target_return": Number(optional=True),
+}
 
 SelfModel = TypeVar("SelfModel", bound="SequenceModel")
 
 
 class SequenceModel(BaseAlgorithm):
     """
-    A sequence policy with its environment: built, saved, loaded, exported. Learning is its children's.
+    A sequence policy with its environment: built, saved, loaded, exported. It acts; `OfflineAlgorithm` learns, too.
 
+    :param policy: name or class
+    :param env: it acts in, or its Gymnasium id
+    :param options: of training, which are attributes from now on
+    :param learning_rate: further arguments are those of `OfflineAlgorithm`
+    :param policy_kwargs: arguments of the policy
+    :param tensorboard_log: folder of the TensorBoard log
+    :param verbose: 0 silent, 1 prints the log
+    :param seed: seed of weights, batches and acting
+    :param device: "auto", "cpu" or "cuda"
     :ivar target_return: for acting, environment reward units; given to each environment of the model that is wrapped
         without a target. None where a file does not tell
     :ivar buffer: what it learns from, None where a model only acts
@@ -47,37 +69,64 @@ class SequenceModel(BaseAlgorithm):
 
     policy: SequencePolicy
     action_space: ActionSpace
-    buffer: TrajectoryBuffer | None
-    target_return: float | None
-    score_reference: ScoreReference | None
-    return_reference: ReturnReference | None
+    batch_size: int
     context_length: int
-    max_timestep: int
+    return_weighting: float
     weight_decay: float
+    learning_rate_schedule: str
+    warmup_steps: int
+    max_grad_norm: float | None
     ema_decay: float
-    _last_saved: str | None
+    precision: str
+    compile: bool | None
 
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        """`help` of the first class that has a policy lists all parameters, those of policy and head, too."""
-        super().__init_subclass__(**kwargs)
-        algorithm: type[Any] = cls.__mro__[1]
-        policy = cls.policy_aliases.get(POLICY_NAMES[0])
-        if isinstance(policy, type) and issubclass(policy, SequencePolicy) and not algorithm.policy_aliases:
-            parts = [
-                inspect.cleandoc(cls.__doc__ or ""),
-                documented_parameters(algorithm),
-                "`policy_kwargs` may hold:",
-                documented_parameters(PolicyOptions),
-                documented_parameters(policy.head_class.options_class),
-            ]
-            cls.__doc__ = "\n\n".join(filter(None, parts))
+    def __init__(
+        self,
+        policy: str | type[SequencePolicy],
+        env: GymEnv | str | None,
+        options: TrainingOptions,
+        learning_rate: float | Schedule,
+        policy_kwargs: dict[str, Any] | None,
+        tensorboard_log: str | None,
+        verbose: int,
+        seed: int | None,
+        device: th.device | str,
+    ) -> None:
+        super().__init__(
+            self._get_policy_from_name(policy) if isinstance(policy, str) else policy,
+            env,
+            learning_rate,
+            policy_kwargs=policy_kwargs,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            support_multi_env=True,
+            seed=seed,
+            supported_action_spaces=(spaces.Box, spaces.Discrete),
+        )
+        self.target_return: float | None = None
+        if self.env is not None:
+            self._policy_class.head_for(self.action_space)  # before the data are read, which may take long
+            self.target_return = share_target_return(self.env, None)
+        vars(self).update(vars(options))
+        self.max_timestep = 1000
+        self.score_reference: ScoreReference | None = None
+        self.return_reference: ReturnReference | None = None
+        self.buffer: TrajectoryBuffer | None = None
+        self._means = RunningMeans()
+        self._last_saved: str | None = None  # by this object
 
     def _check_arguments(self, learning_rate: Rule) -> None:
         """
         :param learning_rate: what a number may be that is given as such: 0 is for those who load a model to act with it
         :raises ValueError: an argument out of range, by name
         """
-        raise NotImplementedError
+        if isinstance(self.learning_rate, UnsavedSchedule) and learning_rate is POSITIVE:
+            self.learning_rate.check()
+        accepted = ACCEPTED if callable(self.learning_rate) else {**ACCEPTED, "learning_rate": learning_rate}
+        vars(self).update({**vars(TrainingOptions.of(vars(self))), **check_arguments(vars(self), accepted)})
+        if self.batch_size is not None:
+            check_batch_size(self.batch_size)
 
     def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
         """

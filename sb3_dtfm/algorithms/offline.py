@@ -1,5 +1,6 @@
 """Offline learning from recorded episodes: one class, whose children differ in their policy's head."""
 
+import inspect
 import itertools
 import math
 import time
@@ -7,40 +8,20 @@ from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import configure_logger, update_learning_rate
 
-from sb3_dtfm.actions import ActionSpace
-from sb3_dtfm.algorithms.model import SequenceModel
-from sb3_dtfm.algorithms.saving import UnsavedSchedule
-from sb3_dtfm.arguments import (
-    BOOLEAN,
-    COUNT,
-    NOT_NEGATIVE,
-    POSITIVE,
-    PROBABILITY_BELOW_1,
-    Choice,
-    Number,
-    Rule,
-    check_arguments,
-)
+from sb3_dtfm.algorithms.model import POLICY_NAMES, SequenceModel
+from sb3_dtfm.algorithms.options import TrainingOptions
+from sb3_dtfm.arguments import POSITIVE, documented_parameters
 from sb3_dtfm.callbacks import GradientStepProgressBar, TimeLeft, combine_callbacks
-from sb3_dtfm.data import (
-    Dataset,
-    ReturnReference,
-    ScoreReference,
-    TrajectoryBuffer,
-    load_dataset,
-    without_pickles,
-)
+from sb3_dtfm.data import Dataset, TrajectoryBuffer, load_dataset, without_pickles
 from sb3_dtfm.data.decisions import Decision, decide_open, sentences
 from sb3_dtfm.data.inspection import return_reference, suggested_target_return
 from sb3_dtfm.distributed import (
     DataParallel,
     LossFunction,
-    check_batch_size,
     is_first_process,
     local_rank_zero_first,
     n_processes,
@@ -50,9 +31,7 @@ from sb3_dtfm.optimization import (
     BATCHES,
     DROPOUT,
     FINITE,
-    LEARNING_RATE_SCHEDULES,
     NOISE,
-    PRECISIONS,
     TRANSITIONS,
     RunningMeans,
     autocast,
@@ -65,25 +44,12 @@ from sb3_dtfm.optimization import (
     step_seed,
 )
 from sb3_dtfm.policies import SequencePolicy
+from sb3_dtfm.policies.options import PolicyOptions
 from sb3_dtfm.transitions import ENDS, Transitions
 from sb3_dtfm.windows import Windows
 
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineAlgorithm")
 
-ACCEPTED: dict[str, Rule] = {
-    "batch_size": COUNT._replace(optional=True),
-    "weight_decay": NOT_NEGATIVE,
-    "context_length": Number(low=1, high=100_000, whole=True),
-    "return_weighting": NOT_NEGATIVE._replace(optional=True),
-    "max_grad_norm": NOT_NEGATIVE._replace(optional=True),
-    "warmup_steps": Number(low=0, whole=True),
-    "learning_rate_schedule": Choice(LEARNING_RATE_SCHEDULES),
-    "ema_decay": PROBABILITY_BELOW_1,
-    "precision": Choice(PRECISIONS),
-    "compile": Choice((None, *BOOLEAN.values)),
-    "seed": Number(low=0, whole=True, optional=True),
-    "target_return": Number(optional=True),
-}
 # Arguments of the algorithm that the data decide where they are None; the policy's are among `policy_kwargs`.
 DECIDED = {"batch_size", "return_weighting"}
 # Episodes that a message shows at most.
@@ -95,7 +61,7 @@ class OfflineAlgorithm(SequenceModel):
     Learn a sequence policy from recorded episodes: `learn(total_timesteps)` counts gradient steps.
 
     Where `torch.distributed` is initialised, its processes train one model together; callbacks, logs and `save` are those
-    of process 0.
+    of process 0. Arguments that are not described here are :class:`~sb3_dtfm.algorithms.options.TrainingOptions`.
 
     :param policy: "MultiInputPolicy", "MlpPolicy" or "CnnPolicy" (all alike), or a policy class
     :param env: environment, or its Gymnasium id; optional, never used for learning. It is wrapped in
@@ -103,26 +69,11 @@ class OfflineAlgorithm(SequenceModel):
     :param dataset: Minari id or dataset, path of a file or folder, or data in memory; see
         :func:`~sb3_dtfm.data.load_dataset`
     :param learning_rate: AdamW's, a number or a function of the progress remaining (from 1 to 0)
-    :param batch_size: windows in a gradient step, of all processes together; by default 64 of less than 10,000 recorded
-        steps, and 256 of more
-    :param weight_decay: AdamW's, on weight matrices only
-    :param context_length: K, steps the policy sees
-    :param return_weighting: w: of mixed data, a step of the best episode is learned from 1 + w times as often as one of the
-        worst, and others by their returns in between (Yue et al., 2022); 0 learns from all alike. By default 5 where
-        returns tell how episodes act, and 0 elsewhere
     :param dataset_kwargs: further arguments of :func:`~sb3_dtfm.data.load_dataset`: `{"cache_dir": folder}` for datasets
         larger than memory, `{"fraction": 0.5}` for a random half of the episodes, `{"env_id": id}` for data that were
         recorded under another environment's name, and the reader's own, for example `{"filter_key": "train"}` for robomimic.
         `max_episode_steps` is the environment's unless it is given, and stays the model's when it is saved: what episodes
         hold beyond it is left out, since no episode of the environment gets there; None keeps it
-    :param max_grad_norm: clip the gradient's norm to this; None and 0 do not clip
-    :param warmup_steps: gradient steps over which the learning rate rises linearly from zero; 0 for none
-    :param learning_rate_schedule: factor on the learning rate: "constant", or "linear" or "cosine" down to zero
-    :param ema_decay: decay of the exponential moving average of weights that acts; 0 acts with the trained weights
-    :param precision: of matrix products: "float32", "bfloat16" (autocast), or "auto": bfloat16 where the hardware has
-        instructions for it, on a CPU only if it is the faster one for this model, which is measured once
-    :param compile: compile the loss with `torch.compile`; None does so on a GPU, where one process starts its kernels as a
-        CUDA graph. It takes a minute, and a C++ compiler
     :param policy_kwargs: arguments of the policy, for example `embed_dim`, `n_layers`, `n_heads`, `dropout`, `kv_cache`. The
         data decide some that are not given, see :mod:`sb3_dtfm.data.decisions`
     :param tensorboard_log: folder of the TensorBoard log, None for no log
@@ -137,9 +88,18 @@ class OfflineAlgorithm(SequenceModel):
     :raises DatasetError: the dataset cannot be read, or does not fit the environment
     """
 
-    policy: SequencePolicy
-    action_space: ActionSpace
     progress_bar_class: type[ProgressBarCallback] = GradientStepProgressBar
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """`help` of an algorithm lists all parameters, those of training, policy and head, too."""
+        super().__init_subclass__(**kwargs)
+        policy: Any = cls.policy_aliases.get(POLICY_NAMES[0])
+        if cls.__base__ is OfflineAlgorithm and policy is not None:
+            order = inspect.signature(cls).parameters
+            own = documented_parameters(OfflineAlgorithm, TrainingOptions, order=order)
+            of_the_policy = documented_parameters(PolicyOptions, policy.head_class.options_class)
+            parts = [inspect.cleandoc(cls.__doc__ or ""), own, "`policy_kwargs` may hold:", of_the_policy]
+            cls.__doc__ = "\n\n".join(parts)
 
     def __init__(
         self,
@@ -147,17 +107,17 @@ class OfflineAlgorithm(SequenceModel):
         env: GymEnv | str | None = None,
         dataset: Dataset | None = None,
         learning_rate: float | Schedule = 1e-3,
-        batch_size: int | None = None,
-        weight_decay: float = 1e-3,
-        context_length: int = 1,
-        return_weighting: float | None = None,
+        batch_size: int | None = TrainingOptions.batch_size,
+        weight_decay: float = TrainingOptions.weight_decay,
+        context_length: int = TrainingOptions.context_length,
+        return_weighting: float | None = TrainingOptions.return_weighting,
         dataset_kwargs: dict[str, Any] | None = None,
-        max_grad_norm: float | None = None,
-        warmup_steps: int = 100,
-        learning_rate_schedule: str = "cosine",
-        ema_decay: float = 0.999,
-        precision: str = "float32",
-        compile: bool | None = None,
+        max_grad_norm: float | None = TrainingOptions.max_grad_norm,
+        warmup_steps: int = TrainingOptions.warmup_steps,
+        learning_rate_schedule: str = TrainingOptions.learning_rate_schedule,
+        ema_decay: float = TrainingOptions.ema_decay,
+        precision: str = TrainingOptions.precision,
+        compile: bool | None = TrainingOptions.compile,
         policy_kwargs: dict[str, Any] | None = None,
         tensorboard_log: str | None = None,
         verbose: int = 0,
@@ -165,43 +125,13 @@ class OfflineAlgorithm(SequenceModel):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:
-        super().__init__(
-            self._get_policy_from_name(policy) if isinstance(policy, str) else policy,
-            env,
-            learning_rate,
-            policy_kwargs=policy_kwargs,
-            tensorboard_log=tensorboard_log,
-            verbose=verbose,
-            device=device,
-            support_multi_env=True,
-            seed=seed,
-            supported_action_spaces=(spaces.Box, spaces.Discrete),
-        )
-        self.target_return: float | None = None
-        if self.env is not None:
-            self._policy_class.head_for(self.action_space)  # before the data are read, which may take long
-            self.target_return = share_target_return(self.env, None)
+        options = TrainingOptions.of(locals())
+        super().__init__(policy, env, options, learning_rate, policy_kwargs, tensorboard_log, verbose, seed, device)
         self.dataset = dataset
-        self.batch_size: int = batch_size  # type: ignore[assignment]  # None until the data have decided
-        self.weight_decay = weight_decay
-        self.context_length = context_length
-        self.return_weighting: float = return_weighting  # type: ignore[assignment]  # as batch_size
         self.dataset_kwargs = dataset_kwargs
-        self.max_grad_norm = max_grad_norm
-        self.warmup_steps = warmup_steps
-        self.learning_rate_schedule = learning_rate_schedule
-        self.ema_decay = ema_decay
-        self.precision = precision
-        self.compile = compile
-        self.max_timestep = 1000
         self.time_limit: int | None = None  # of the newest environment that it learned for
-        self.score_reference: ScoreReference | None = None
         self.decisions: list[Decision] = []
-        self.return_reference: ReturnReference | None = None
-        self.buffer: TrajectoryBuffer | None = None
-        self._means = RunningMeans()
         self._training_seconds, self._timed_steps = 0.0, 0
-        self._last_saved: str | None = None  # by this object
         self._current_learning_rate = 0.0
         self._training_seed: int | None = None  # where `seed` is None
         if _init_setup_model:
@@ -230,14 +160,6 @@ class OfflineAlgorithm(SequenceModel):
         for name in DECIDED & set(values):
             setattr(self, name, values.pop(name))
         self.policy_kwargs = {**values, **given}
-
-    def _check_arguments(self, learning_rate: Rule) -> None:
-        if isinstance(self.learning_rate, UnsavedSchedule) and learning_rate is POSITIVE:
-            self.learning_rate.check()
-        accepted = ACCEPTED if callable(self.learning_rate) else {**ACCEPTED, "learning_rate": learning_rate}
-        vars(self).update(check_arguments(vars(self), accepted))
-        if self.batch_size is not None:
-            check_batch_size(self.batch_size)
 
     def set_dataset(self, dataset: Dataset) -> None:
         """

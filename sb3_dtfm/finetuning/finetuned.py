@@ -10,8 +10,8 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
-from sb3_dtfm.algorithms import DTFM
-from sb3_dtfm.algorithms.model import POLICY_NAMES
+from sb3_dtfm.algorithms.model import POLICY_NAMES, SequenceModel
+from sb3_dtfm.algorithms.options import TrainingOptions
 from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
 from sb3_dtfm.finetuning.online_actor import (
     ACTIVATIONS,
@@ -62,7 +62,7 @@ class FinetunedPolicy(DTFMPolicy):
         super().save(path)
 
 
-class FinetunedDTFM(DTFM):
+class FinetunedDTFM(SequenceModel):
     """
     A DTFM with a noise policy (noise-space RL) or a residual policy (residual RL) that an online algorithm has learned.
     It acts, is saved, loaded and exported as a DTFM is.
@@ -72,16 +72,23 @@ class FinetunedDTFM(DTFM):
     algorithm learns from. The actor's mean would begin at zero noise, where robot arms get stuck. A residual action is the
     actor's mean, whatever `deterministic` is: at first nearly none.
 
-    Without an online actor it is the DTFM. It does not learn from data; another actor is learned by
+    Without an online actor it acts as the DTFM does. It does not learn from data; another actor is learned by
     `SAC("MlpPolicy", NoiseActionVecEnv(venv, model))` or `PPO("MlpPolicy", ResidualActionVecEnv(venv, model))`.
+
+    `FinetunedDTFM.of` and `FinetunedDTFM.load` make one.
     """
 
     policy: FinetunedPolicy
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = dict.fromkeys(POLICY_NAMES, FinetunedPolicy)
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        policy: str | type[SequencePolicy] = POLICY_NAMES[0],
+        device: th.device | str = "auto",
+        _init_setup_model: bool = False,
+    ) -> None:
         self.online_actor: dict[str, Any] | None = None
-        super().__init__(*args, **kwargs)
+        super().__init__(policy, None, TrainingOptions(), 0.0, None, None, 0, None, device)
 
     def _make_policy(self, ema: bool) -> SequencePolicy:
         policy = super()._make_policy(ema)
@@ -90,7 +97,7 @@ class FinetunedDTFM(DTFM):
         return policy
 
     @classmethod
-    def of(cls, model: DTFM, agent: BaseAlgorithm | None = None) -> "FinetunedDTFM":
+    def of(cls, model: SequenceModel, agent: BaseAlgorithm | None = None) -> "FinetunedDTFM":
         """
         A copy of a model, with an agent's actor.
 

@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_dtfm.algorithms import DTFM
-from sb3_dtfm.algorithms.offline import OfflineAlgorithm
+from sb3_dtfm.algorithms.model import SequenceModel
 from sb3_dtfm.arguments import POSITIVE, check_arguments
 from sb3_dtfm.envs import BETWEEN, OBSERVATION, RETURN_TO_GO, TIMESTEP, check_vec_env, share_target_return
 from sb3_dtfm.finetuning.online_actor import actor_observation
@@ -40,7 +40,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
     def __init__(
         self,
         venv: VecEnv,
-        model: OfflineAlgorithm | str | PathLike[str],
+        model: SequenceModel | str | PathLike[str],
         bound: float,
         hidden_state: bool = False,
     ) -> None:

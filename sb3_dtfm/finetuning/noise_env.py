@@ -7,7 +7,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_dtfm.algorithms.offline import OfflineAlgorithm
+from sb3_dtfm.algorithms.model import SequenceModel
 from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
 from sb3_dtfm.finetuning.online_actor import check_noise_actions
 from sb3_dtfm.policies import SequencePolicy
@@ -58,7 +58,7 @@ class NoiseActionVecEnv(FrozenPolicyVecEnv):
     def __init__(
         self,
         venv: VecEnv,
-        model: OfflineAlgorithm | str | PathLike[str],
+        model: SequenceModel | str | PathLike[str],
         bound: float = NOISE_BOUND,
         hidden_state: bool = False,
     ) -> None:

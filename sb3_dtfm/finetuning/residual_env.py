@@ -8,7 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_dtfm.algorithms.offline import OfflineAlgorithm
+from sb3_dtfm.algorithms.model import SequenceModel
 from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
 from sb3_dtfm.finetuning.online_actor import check_residual_actions
 from sb3_dtfm.policies import SequencePolicy
@@ -38,7 +38,7 @@ class ResidualActionVecEnv(FrozenPolicyVecEnv):
     def __init__(
         self,
         venv: VecEnv,
-        model: OfflineAlgorithm | str | PathLike[str],
+        model: SequenceModel | str | PathLike[str],
         bound: float = RESIDUAL_BOUND,
         hidden_state: bool = False,
     ) -> None:

@@ -8,6 +8,8 @@ import pytest
 import torch as th
 
 from sb3_dtfm import DT, DTFM
+from sb3_dtfm.algorithms.offline import OfflineAlgorithm
+from sb3_dtfm.algorithms.options import TrainingOptions
 from tests.algorithms.small import make_model
 from tests.conftest import make_env
 
@@ -232,3 +234,12 @@ def test_help_lists_every_parameter_those_of_policy_and_head_too(algorithm):
     constructor = set(inspect.signature(algorithm).parameters)
     options = algorithm.policy_aliases["MultiInputPolicy"].parameter_names()
     assert sorted(listed) == sorted([*constructor, *options])
+
+
+def test_the_constructor_takes_each_option_of_training_with_its_default(cheetah_buffer):
+    taken = {name: parameter.default for name, parameter in inspect.signature(OfflineAlgorithm).parameters.items()}
+    defaults = TrainingOptions.defaults()
+    assert {name: taken[name] for name in defaults} == defaults
+    given = {name: {int: 2, float: 0.5}.get(type(default), default) for name, default in defaults.items()}
+    model = make_model(DT, cheetah_buffer, **given | {"batch_size": 8})
+    assert TrainingOptions.of(vars(model)) == TrainingOptions(**given | {"batch_size": 8, "return_weighting": 0.0})

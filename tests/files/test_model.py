@@ -20,7 +20,8 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.algorithms.loading import SAVED
-from sb3_dtfm.algorithms.offline import ACCEPTED
+from sb3_dtfm.algorithms.model import ACCEPTED
+from sb3_dtfm.algorithms.options import TrainingOptions
 from sb3_dtfm.files import ModelFileError
 from tests.algorithms.small import make_model
 from tests.conftest import make_env
@@ -357,8 +358,13 @@ def test_a_directory_that_leads_nowhere_is_refused(saved, tmp_path):
 
 def test_each_attribute_in_a_file_has_a_rule(saved):
     """So that no file sets what nobody looks at."""
-    own = {"policy_kwargs", "dataset_kwargs", "score_reference", "return_reference"}
-    assert set(json.loads(members(saved)["model.json"])["attributes"]) <= {*SAVED, *ACCEPTED, *own}
+    own = {*TrainingOptions.defaults(), "policy_kwargs", "dataset_kwargs", "score_reference", "return_reference"}
+    assert set(json.loads(members(saved)["model.json"])["attributes"]) <= {
+        *SAVED,
+        *ACCEPTED,
+        *TrainingOptions.defaults(),
+        *own,
+    }
 
 
 def test_a_cache_folder_is_not_saved(cheetah_buffer, tmp_path):

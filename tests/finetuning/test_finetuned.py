@@ -106,6 +106,10 @@ def test_a_file_holds_both_and_nothing_that_is_run(model, agent, tmp_path):
         DTFM.load(tmp_path / "finetuned")
 
 
+def test_it_has_no_part_that_learns():
+    assert not {"train", "compute_loss", "set_dataset"} & set(dir(FinetunedDTFM))
+
+
 def test_without_an_actor_it_is_the_dtfm(model, tmp_path):
     FinetunedDTFM.of(model).save(tmp_path / "without_actor")
     observations = make_venv().reset()
