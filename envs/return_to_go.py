@@ -204,6 +204,12 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return None if self.spec is None else Task(self.spec.id, self.spec.max_episode_steps)
 
     @property
+    def env_args(self) -> dict[str, Any] | None:
+        """How the environment describes itself as robomimic's files do; None where it does not."""
+        found = getattr(self.unwrapped, "env_args", None)
+        return found if isinstance(found, dict) else None
+
+    @property
     def recorded_space(self) -> spaces.Space:
         """The environment's own observation space, with sorted keys."""
         return self.env.observation_space if self._cameras else self._vector_space

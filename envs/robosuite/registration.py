@@ -74,26 +74,33 @@ def env_kwargs_from_robomimic(env_args: str | dict[str, Any]) -> dict[str, Any]:
     return {"task": task, "controller_config": config, "lite_physics": kwargs.get("lite_physics", True)}
 
 
-def differences_from_robomimic(env_args: str | dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+def differences_from_robomimic(
+    env_args: str | dict[str, Any], ours: str | dict[str, Any] | None = None
+) -> dict[str, tuple[Any, Any]]:
     """
-    How actions of a robomimic file move another arm, or the arm otherwise, than in a registered environment of ours.
+    How actions of a robomimic file move another arm, or the arm otherwise, than in an environment of ours.
 
     :param env_args: as for :func:`env_id_from_robomimic`
-    :return: by the name of each field that differs, its value in the file and ours; a field that is missing does not differ
+    :param ours: `RobosuiteEnv.env_args` of the environment; by default a registered one
+    :return: by the name of each field that differs, its value in the file and ours; a field that is missing counts as that
+        of a registered environment
     """
-    kwargs = _parsed(env_args)[1].get("env_kwargs", {})
-    differences: dict[str, tuple[Any, Any]] = {}
-    if kwargs.get("robots", "Panda") not in ROBOTS:
-        differences["robots"] = kwargs["robots"], "Panda"
-    if kwargs.get("control_freq", CONTROL_FREQUENCY) != CONTROL_FREQUENCY:
-        differences["control_freq"] = kwargs["control_freq"], CONTROL_FREQUENCY
-    arm = arm_controller(kwargs)
-    for name, ours in CONTROLLER.items():
-        theirs = arm.get(name, arm.get(OLD_NAMES.get(name, name), ours))
-        numbers = type(ours) in (int, list) and theirs is not None  # one for all six dimensions, or one for each
-        if not (np.allclose(theirs, ours) if numbers else theirs == ours):
-            differences[name] = theirs, ours
+    theirs, own = _motion(env_args), _motion(ours or {})
+    differences = {}
+    for name, value in theirs.items():
+        numbers = type(CONTROLLER.get(name)) in (int, list) and None not in (value, own[name])  # one for all, or for each
+        if not (np.allclose(value, own[name]) if numbers else value == own[name]):
+            differences[name] = value, own[name]
     return differences
+
+
+def _motion(env_args: str | dict[str, Any]) -> dict[str, Any]:
+    """What an action does, by robosuite's names."""
+    kwargs = _parsed(env_args)[1].get("env_kwargs", {})
+    arm, robots = arm_controller(kwargs), kwargs.get("robots", "Panda")
+    motion = {name: arm.get(name, arm.get(OLD_NAMES.get(name, name), ours)) for name, ours in CONTROLLER.items()}
+    motion["robots"] = "Panda" if robots in ROBOTS else robots
+    return {**motion, "control_freq": kwargs.get("control_freq", CONTROL_FREQUENCY)}
 
 
 def arm_controller(env_kwargs: dict[str, Any]) -> dict[str, Any]:

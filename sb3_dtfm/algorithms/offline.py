@@ -186,7 +186,8 @@ class OfflineAlgorithm(SequenceModel):
         if self.env is not None and (task := known_task(self.env)) is not None:
             self.time_limit = task.max_episode_steps
         known = {"action_space": getattr(self, "action_space", None), "max_episode_steps": self.time_limit}
-        known["observation_space"] = None if self.env is None else recorded_space(self.env)
+        if self.env is not None:
+            known.update(observation_space=recorded_space(self.env), env_args=self.env.get_attr("env_args", [0])[0])
         with local_rank_zero_first():
             buffer = load_dataset(self.dataset, **{**known, **without_pickles(self.dataset_kwargs)})
         images = {camera: channels_first(space) for camera, space in buffer.image_spaces.items()}

@@ -38,7 +38,7 @@ Dataset: TypeAlias = (
 )
 # What load_dataset itself does with a dataset of any kind.
 COMMON_OPTIONS = (
-    *("env_id", "action_space", "observation_space", "max_episode_steps", "min_return", "best_share"),
+    *("env_id", "env_args", "action_space", "observation_space", "max_episode_steps", "min_return", "best_share"),
     *("success_only", "fraction", "fraction_seed", "allow_pickle"),
 )
 # What some of the options may be, where their readers do not look.
@@ -83,6 +83,7 @@ def load_several(
     action_space: ActionSpace | None = None,
     observation_space: spaces.Space | None = None,
     env_id: str | None = None,
+    env_args: dict[str, Any] | None = None,
     max_episode_steps: int | None = None,
     allow_pickle: bool = False,
 ) -> TrajectoryBuffer:
@@ -94,6 +95,7 @@ def load_several(
     :param action_space: see :func:`load_dataset`; like the next ones it counts for each that has none of its own
     :param observation_space: see :func:`load_dataset`
     :param env_id: see :func:`load_dataset`
+    :param env_args: see :func:`load_dataset`
     :param max_episode_steps: see :func:`load_dataset`
     :param allow_pickle: see :func:`load_dataset`
     :raises DatasetError: one of them cannot be read, or is of another task; a weight that is no positive number
@@ -105,7 +107,7 @@ def load_several(
         if not POSITIVE.accepts(weight):
             raise DatasetError(f"dataset {dataset!s}: weight is {weight!r}; a positive number is accepted.")
         shared: dict[str, Any] = {"action_space": action_space, "observation_space": observation_space, "env_id": env_id}
-        shared.update(max_episode_steps=max_episode_steps, allow_pickle=allow_pickle)
+        shared.update(env_args=env_args, max_episode_steps=max_episode_steps, allow_pickle=allow_pickle)
         buffers.append(load_dataset(dataset, **{**shared, **options}))
         weights.append(float(weight))
     return TrajectoryBuffer.join(buffers, weights)
@@ -137,6 +139,7 @@ def load_dataset(
     dataset: Dataset,
     cache_dir: str | os.PathLike[str] | None = None,
     env_id: str | None = None,
+    env_args: dict[str, Any] | None = None,
     action_space: ActionSpace | None = None,
     observation_space: spaces.Space | None = None,
     max_episode_steps: int | None = None,
@@ -159,6 +162,7 @@ def load_dataset(
     :param cache_dir: learn from memory-mapped files in this folder, for datasets larger than memory; they are written at
         the first call and whenever the dataset has changed. None reads everything into memory
     :param env_id: Gymnasium id of the environment that the episodes count as coming from, whatever the dataset says
+    :param env_args: the environment's description in robomimic's words, for robomimic files, see :func:`load_robomimic`
     :param action_space: the environment's, for data that do not tell of a range of actions
     :param observation_space: the environment's, for data that do not tell what is a choice: a Discrete part becomes a vector
         of zeros and a one, as :class:`~sb3_dtfm.envs.ReturnToGoWrapper` shows it
@@ -193,7 +197,7 @@ def load_dataset(
             f"dataset {name}: unknown option {with_nearest(unknown, accepted)}; accepted: {', '.join(accepted)}."
         )
     common: dict[str, Any] = {"action_space": action_space, "observation_space": observation_space, "env_id": env_id}
-    common.update(max_episode_steps=max_episode_steps, allow_pickle=allow_pickle)
+    common.update(env_args=env_args, max_episode_steps=max_episode_steps, allow_pickle=allow_pickle)
     kwargs.update((name, value) for name, value in common.items() if name in parameters)
     if cache_dir is None or reader.fingerprint is None:
         buffer = reader.load(dataset, **kwargs)

@@ -45,10 +45,10 @@ def fingerprint_robomimic(path: str | os.PathLike[str], options: dict[str, Any])
     :raises DatasetError: no such file, or one of another robot or controller, see :func:`load_robomimic`
     """
     options = dict(options)
-    meant_for = options.pop("env_id", None)  # which a cache does not hold
+    known = {name: options.pop(name, None) for name in ("env_id", "env_args")}  # which a cache does not hold
     with _opened(path) as (file, source):
         if "data" in set(file):
-            _env_id(_env_args(open_group(file, "data", source), source), source, meant_for)
+            _env_id(_env_args(open_group(file, "data", source), source), source, **known)
     return Fingerprint.of(Path(source).name, Path(source), options)
 
 
@@ -68,6 +68,7 @@ def load_robomimic(
     observation_keys: Sequence[str] | None = None,
     clip_actions: bool = False,
     env_id: str | None = None,
+    env_args: dict[str, Any] | None = None,
     on_invalid: str = "raise",
     storage: FileStorage | None = None,
 ) -> TrajectoryBuffer:
@@ -90,6 +91,8 @@ def load_robomimic(
     :param clip_actions: bring actions outside of the controller's input range to the nearest bound
     :param env_id: the environment that the file's actions are meant for; not given, it is ours of the file's task, and a
         file of another robot or controller is refused
+    :param env_args: `RobosuiteEnv.env_args` of the environment whose robot and controller have to be the file's; by default
+        those of the registered ones
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
     :param storage: where the steps go, memory if not given
     :return: actions in the controller's input range, [-1, 1] if the file says nothing else
@@ -98,7 +101,7 @@ def load_robomimic(
     """
     keys = tuple(observation_keys or DEFAULT_OBSERVATION_KEYS)
     with _opened(path) as (file, source):
-        return _read(file, source, filter_key, keys, clip_actions, env_id, on_invalid, storage)
+        return _read(file, source, filter_key, keys, clip_actions, (env_id, env_args), on_invalid, storage)
 
 
 class _Labels(NamedTuple):
@@ -116,7 +119,7 @@ def _read(
     filter_key: str | None,
     observation_keys: tuple[str, ...],
     clip_actions: bool,
-    env_id: str | None,
+    meant_for: tuple[str | None, dict[str, Any] | None],
     on_invalid: str,
     storage: FileStorage | None,
 ) -> TrajectoryBuffer:
@@ -140,7 +143,7 @@ def _read(
     rewards = _rewards(labels)
     if not any(demo.rewards is not None and demo.rewards.any() for demo in labels.values()):
         warn_of_made_up_rewards((), source)
-    env_id = _env_id(env_args, source, env_id)
+    env_id = _env_id(env_args, source, *meant_for)
     n_actions = next((labels[name].n_actions for name in demos if name in labels), None)
     if n_actions is None:
         raise refused[demos[0]]
@@ -205,18 +208,19 @@ def _env_args(data: h5py.Group, source: str) -> dict[str, Any]:
     return env_args if isinstance(env_args, dict) else {}
 
 
-def _env_id(env_args: dict[str, Any], source: str, meant_for: str | None) -> str | None:
-    """Our environment of the file's task; if none is named that the file is meant for, its actions have to do the same."""
+def _env_id(recorded: dict[str, Any], source: str, env_id: str | None, env_args: dict[str, Any] | None) -> str | None:
+    """Our environment of the file's task; if no id says what the file is meant for, its actions have to do the same."""
     with wrap_dataset_errors(f"{source}: attribute 'env_args' of group 'data'"):
-        env_id = env_id_from_robomimic(env_args)
-        differences = {} if env_id is None else differences_from_robomimic(env_args)
-    if differences and meant_for is None:
+        own_id = env_id_from_robomimic(recorded)
+        differences = {} if own_id is None or env_id else differences_from_robomimic(recorded, env_args)
+    if differences:
         found = ", ".join(f"{name} is {theirs!r} instead of {ours!r}" for name, (theirs, ours) in differences.items())
         raise DatasetError(
-            f"{source}: an action does something else than in {env_id}: {found}. For an environment with these "
-            "settings (sb3_dtfm.envs.robosuite.env_kwargs_from_robomimic) give its id, dataset_kwargs={'env_id': ...}."
+            f"{source}: an action does something else than in {'the environment' if env_args else own_id}: {found}. Give an "
+            "environment with the file's settings (sb3_dtfm.envs.robosuite.env_kwargs_from_robomimic), or say what the "
+            "actions are meant for, dataset_kwargs={'env_id': ...}."
         )
-    return env_id
+    return own_id
 
 
 def _check_count(group: h5py.Group, name: str, n_steps: int, where: str) -> None:

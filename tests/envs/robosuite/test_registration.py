@@ -1,11 +1,14 @@
 """Names of the tasks: Gymnasium's and robomimic's."""
 
+import contextlib
 import json
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
+from sb3_dtfm import DT
+from sb3_dtfm.data import DatasetError
 from sb3_dtfm.envs.robosuite import (
     TASKS,
     RobosuiteEnv,
@@ -14,6 +17,8 @@ from sb3_dtfm.envs.robosuite import (
     env_kwargs_from_robomimic,
     register_robosuite_envs,
 )
+from tests.algorithms.small import make_model
+from tests.data.test_robomimic import make_demo, write
 from tests.envs.robosuite.conftest import rollout
 
 OLD_CONTROLLER = {  # what robomimic's files of robosuite 1.4.1 hold
@@ -109,3 +114,22 @@ def test_env_args_describe_the_environment(task, environment):
 def test_foreign_env_args_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         env_kwargs_from_robomimic({"env_name": "Lift", "env_kwargs": {}, **changes})
+
+
+@pytest.mark.parametrize("options", [{}, {"cache_dir": "cache"}], ids=["memory", "cache"])
+def test_data_are_of_the_environment_s_own_controller(lift, options, tmp_path, monkeypatch):
+    """Whichever of them is the stiffer one; data that move the arm as the environment does need no word."""
+    monkeypatch.chdir(tmp_path)
+    register_robosuite_envs()
+    controller = OLD_CONTROLLER | {"kp": 300}
+    with contextlib.closing(gym.make("robosuite/Lift-v0", controller_config=controller)) as stiff:
+        assert stiff.unwrapped._env.robots[0].part_controllers["right"].kp[0] == 300
+        common = write("common.hdf5", {"demo_0": make_demo(12)}, json.loads(json.dumps(lift.env_args)))
+        own = write("own.hdf5", {"demo_0": make_demo(12)}, json.loads(json.dumps(stiff.unwrapped.env_args)))
+        assert make_model(DT, own, env=stiff, dataset_kwargs=options).buffer.env_id == "robosuite/Lift-v0"
+        assert make_model(DT, common, env=lift, dataset_kwargs=options).buffer.env_id == "robosuite/Lift-v0"
+        for path, env, found in ((common, stiff, "kp is 150 instead of 300"), (own, lift, "kp is 300 instead of 150")):
+            with pytest.raises(DatasetError, match=f"an action does something else than in the environment: {found}"):
+                make_model(DT, path, env=env, dataset_kwargs=options)
+        insisting = options | {"env_id": "robosuite/Lift-v0"}
+        assert make_model(DT, common, env=stiff, dataset_kwargs=insisting).buffer.env_id == "robosuite/Lift-v0"
