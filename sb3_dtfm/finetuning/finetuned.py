@@ -8,6 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.type_aliases import GymEnv
 from torch import nn
 
 from sb3_dtfm.algorithms.model import POLICY_NAMES, SequenceModel
@@ -84,11 +85,12 @@ class FinetunedDTFM(SequenceModel):
     def __init__(
         self,
         policy: str | type[SequencePolicy] = POLICY_NAMES[0],
+        env: GymEnv | None = None,
         device: th.device | str = "auto",
         _init_setup_model: bool = False,
     ) -> None:
         self.online_actor: dict[str, Any] | None = None
-        super().__init__(policy, None, TrainingOptions(), 0.0, None, None, 0, None, device)
+        super().__init__(policy, env, TrainingOptions(), 0.0, None, None, 0, None, device)
 
     def _make_policy(self, ema: bool) -> SequencePolicy:
         policy = super()._make_policy(ema)

@@ -87,7 +87,8 @@ class OfflineExperimentManager(ExperimentManager):
         self.start = Start([*arguments, "--seed", str(self.seed)], command=self.command)
         self.resumed = resumed
         if resumed is not None:
-            self.start = self.start._replace(tensorboard=Start.read(resumed, self.command).tensorboard)
+            began = Start.read(resumed, self.command)
+            self.start = began._replace(arguments=self.start.arguments)
             if is_first_process():  # what others write is not kept
                 self.save_path, self.params_path = str(resumed), str(resumed / self.env_name)
         self.has_checkpoint = resumed is not None and (resumed / CHECKPOINT).is_file()  # else it begins anew

@@ -18,6 +18,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import TensorBoardOutputFormat, configure
 from torch.utils.tensorboard import SummaryWriter
 
+from sb3_dtfm.arguments import BOOLEAN, check_arguments
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd
 from sb3_dtfm.files import replacing
 from sb3_dtfm.finetuning import OnlineDTFM
@@ -40,11 +41,13 @@ class Start(NamedTuple):
     :param arguments: of RL-Zoo's `train`, or those of the command
     :param tensorboard: folder of its curves, None for none
     :param command: "train" or "finetune"
+    :param has_checkpoint: it has been saved since then; without, the run begins anew
     """
 
     arguments: list[str]
     tensorboard: str | None = None
     command: str = "train"
+    has_checkpoint: bool = False
 
     def write(self, run: Path) -> None:
         """
@@ -58,7 +61,7 @@ class Start(NamedTuple):
         """
         :param run: the run's folder
         :param command: that is to go on with it
-        :raises UsageError: no run of this package's, or of another command, or one that is finished
+        :raises UsageError: no run of this package's, or of another command, or one that is finished or lacks its checkpoint
         """
         if not run.is_dir():
             raise UsageError(f"--resume {run}: no such folder; expected that of a run, as logs/dtfm/HalfCheetah-v5_1.")
@@ -71,11 +74,19 @@ class Start(NamedTuple):
             strings = [*start.arguments, start.command, *([] if start.tensorboard is None else [start.tensorboard])]
             if not isinstance(start.arguments, list) or not all(isinstance(each, str) for each in strings):
                 raise TypeError("expected a list of arguments, and the folder of its curves")
+            check_arguments(start._asdict(), {"has_checkpoint": BOOLEAN})
         except (ValueError, TypeError, RecursionError) as error:
             raise UsageError(f"--resume {run}: {START} is damaged: {error}.") from error
         if start.command != command:
             raise UsageError(
                 f"--resume {run}: `sb3-dtfm {start.command}` started it; sb3-dtfm {start.command} --resume goes on."
+            )
+        if start.has_checkpoint and not (run / CHECKPOINT).is_file():
+            models = sorted(run.glob("[!.]*.zip"), key=os.path.getmtime)
+            copied = f", or copy the run's newest model there: cp {models[-1]} {run / CHECKPOINT}" if models else ""
+            raise UsageError(
+                f"--resume {run}: {CHECKPOINT} is missing, from which the run goes on; it would begin anew and replace what "
+                f"it has learned. Put the file back{copied}."
             )
         return start
 
@@ -197,6 +208,7 @@ class KeepCheckpoint(BaseCallback):
         if isinstance(self.model, OnlineDTFM) and self.model.replay_buffer is not None:
             self.model.save_replay_buffer(self.path.with_name(EPISODES))
         self.model.save(self.path)
+        self.start = self.start._replace(has_checkpoint=True)
         self._write_start()  # which is not there yet if the first evaluation was ended
         self._saved_at = time.monotonic()
 

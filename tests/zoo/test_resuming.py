@@ -1,5 +1,6 @@
 """`sb3-dtfm train --resume`: a run that was ended or killed becomes what it would have been."""
 
+import json
 import os
 import signal
 import subprocess
@@ -150,9 +151,8 @@ def test_sigterm_saves_any_algorithm(workplace):
     assert 32 <= PPO.load("logs/ppo/Pendulum-v1_1/Pendulum-v1.zip", device="cpu").num_timesteps < 640
 
 
-@pytest.mark.parametrize("interval", [0.0, 1e9])
-def test_a_killed_run_goes_on_from_its_last_checkpoint_or_from_the_start(interval, straight, workplace):
-    """Killed behind a log entry and an evaluation that its checkpoint does not know: they are not there twice."""
+def kill(interval: float) -> None:
+    """Kill a run in its midst, whose last checkpoint is of step 18, or which has none."""
     script = (
         "import torch; torch.set_num_threads(1)\n"
         "import sb3_dtfm.zoo.resuming as resuming\nfrom sb3_dtfm.cli.main import main\n"
@@ -164,7 +164,35 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint_or_from_the_start(interva
     killed = subprocess.run([sys.executable, "-c", script], env=finds_tests(), stdout=subprocess.DEVNULL)
     assert killed.returncode == -signal.SIGKILL
     assert (RUN / START).is_file()
+
+
+@pytest.mark.parametrize("interval", [0.0, 1e9])
+def test_a_killed_run_goes_on_from_its_last_checkpoint_or_from_the_start(interval, straight, workplace):
+    """Killed behind a log entry and an evaluation that its checkpoint does not know: they are not there twice."""
+    kill(interval)
     assert (RUN / CHECKPOINT).is_file() == (interval == 0.0)
+    assert resume(*training()[1:]) == 0
+    assert_same(what_was_learned(), straight)
+
+
+@pytest.mark.parametrize("given_back", ["what was deleted", "another model of the run"])
+def test_without_its_checkpoint_a_killed_run_does_not_begin_anew(given_back, straight, workplace, capsys):
+    kill(0.0)
+    checkpoint = RUN / CHECKPOINT
+    kept = checkpoint.rename("kept.zip")
+    held = {path: path.read_bytes() for path in RUN.rglob("*") if path.is_file()}
+    for _ in range(2):
+        assert main(["train", "--resume", str(RUN)]) == 2
+        error = capsys.readouterr().err.strip().splitlines()[-1]
+        assert f"--resume {RUN}: {CHECKPOINT} is missing" in error
+        assert {path: path.read_bytes() for path in RUN.rglob("*") if path.is_file()} == held
+    if given_back == "what was deleted":
+        kept.rename(checkpoint)
+    else:
+        command = error.split("newest model there: ")[1].removesuffix(".")
+        assert command == f"cp {RUN / 'best_model.zip'} {checkpoint}"
+        assert subprocess.run(command.split()).returncode == 0
+        assert DTFM.load(checkpoint).num_timesteps in (0, 10, 20)
     assert resume(*training()[1:]) == 0
     assert_same(what_was_learned(), straight)
 
@@ -192,6 +220,8 @@ def test_what_an_agent_knew_is_not_lost_with_a_run_that_was_killed_early(workpla
     assert main([*training((SIGNAL_AT, signal.SIGINT)), "-i", str(agent)]) == 0
     second = RUN.with_name("HalfCheetah-v5_2")
     (second / CHECKPOINT).unlink()  # as if it had been killed before there was one
+    began = json.loads((second / START).read_text())
+    (second / START).write_text(json.dumps({**began, "has_checkpoint": False}))
     assert main(["train", "--resume", str(second)]) == 0
     model = DTFM.load(second / "HalfCheetah-v5.zip")  # which the same signal has interrupted again
     assert (model.num_timesteps, model._n_updates) == (SIGNAL_AT + 1, N_STEPS + SIGNAL_AT + 1)
