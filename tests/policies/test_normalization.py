@@ -5,6 +5,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
+from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.policies.normalization import Normalization
 from sb3_dtfm.windows import Windows
 
@@ -63,3 +64,20 @@ def test_a_policy_without_return_conditioning_sees_none():
 def test_the_unit_is_the_standard_deviation_unless_asked_for():
     normalized = make_normalization(observation_scaling="std")(make_windows([2.0, 6.0], 0.0, 0))
     assert normalized.observations.flatten().tolist() == [0.5, 0.0]
+
+
+@pytest.mark.parametrize(("deviation", "expected"), [(6e-6, 0.0), (6e-5, 1.0)], ids=["noise of rounding", "a signal"])
+def test_a_deviation_of_6e_6_is_a_constant(deviation, expected):
+    """As recorded, in what settings are decided from, and at acting, where it may be far from what it was."""
+    steps = np.stack([np.arange(8.0), 1.0 + deviation * np.tile([-1.0, 1.0], 4)], axis=1)
+    episode = Trajectory(steps, np.zeros((8, 1)), np.ones(8), terminated=False, truncated=True)
+    buffer = TrajectoryBuffer.from_trajectories([episode], spaces.Box(-1.0, 1.0, (1,)))
+    statistics = buffer.statistics()
+    assert statistics.observation_std[1] == pytest.approx(deviation, rel=0.02)
+    one_above, far_away = [3.5, 1.0 + deviation], [3.5, 2.0]
+    assert statistics.normalize(th.tensor([one_above]))[0, 1].item() == pytest.approx(expected, rel=0.03)
+    normalization = make_normalization(observation_scaling="std")
+    normalization.set_statistics(*statistics)
+    for seen, normalized in ((one_above, expected), (far_away, 10.0 * expected)):
+        observations = normalization(make_windows(seen, 0.0, 0)).observations
+        assert observations[0, 0, 1].item() == pytest.approx(normalized, rel=0.03)
