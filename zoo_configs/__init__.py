@@ -8,12 +8,14 @@ import yaml
 
 def paper_settings(algo: str) -> dict[str, Any]:
     """
-    The settings of the method's paper: `DTFM(env=env, dataset=dataset, **paper_settings("dtfm"))`.
+    The settings of the method's paper: `DTFM(env=env, dataset=dataset, **paper_settings("dtfm")).learn(150_000)`.
+
+    The environment's are not among them: the paper acts in `ReturnToGoWrapper(env, target_return, bound_return_to_go=False)`.
 
     :param algo: "dt" or "dtfm"
-    :return: arguments of the class, `policy` among them; for 150,000 gradient steps
+    :return: arguments of the class, `policy` among them
     :raises FileNotFoundError: another name
     """
     text = resources.files("sb3_dtfm.zoo_configs.paper").joinpath(f"{algo}.yml").read_text()
     default: dict[str, Any] = yaml.safe_load(text)["default"]
-    return {name: value for name, value in default.items() if name != "n_timesteps"}
+    return {name: value for name, value in default.items() if name not in ("n_timesteps", "env_wrapper")}

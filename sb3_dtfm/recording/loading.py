@@ -21,6 +21,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_dtfm.algorithms import ALGORITHMS
+from sb3_dtfm.algorithms.model import SequenceModel
+from sb3_dtfm.algorithms.saving import head_name
 from sb3_dtfm.files import holds_pickles, read_configuration, read_run
 from sb3_dtfm.finetuning import FINETUNED, FinetunedDTFM
 from sb3_dtfm.recording.onnx_agent import OnnxAgent
@@ -156,7 +158,7 @@ def _check_algorithm(asked: type[BaseAlgorithm], model: Path) -> None:
     """
     if not holds_pickles(model):
         saved_by = str(read_configuration(model).get("algorithm"))
-        if saved_by not in (each.__name__ for each in asked.__mro__):
+        if not issubclass(asked, SequenceModel) or saved_by != head_name(asked.policy_aliases):
             raise ValueError(f"{model} was saved by {saved_by}, not by {asked.__name__} (--algo).")
         return
     try:

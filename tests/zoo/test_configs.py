@@ -16,6 +16,7 @@ from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.heads import FlowHead
 from sb3_dtfm.policies.options import PolicyOptions
 from sb3_dtfm.zoo.registration import packaged_config, policy_of, register
+from sb3_dtfm.zoo_configs import paper_settings
 
 TARGETS = {
     "HalfCheetah-v5": 20000,
@@ -114,7 +115,21 @@ def test_the_papers_settings():
         "ema_decay": 0.0,
         "return_weighting": 0.0,
         "precision": "auto",
+        "env_wrapper": [{"sb3_dtfm.envs.ReturnToGoWrapper": {"bound_return_to_go": False}}],
     }
+    for settings in load("dtfm", "paper").values():
+        (wrapper,) = settings["env_wrapper"]
+        assert wrapper["sb3_dtfm.envs.ReturnToGoWrapper"]["bound_return_to_go"] is False
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_the_papers_settings_are_arguments_of_the_class(algo):
+    env = gym.make("HalfCheetah-v5")
+    given, settings = paper_settings(algo), load(algo, "paper")["default"]
+    assert set(settings) - set(given) == {"n_timesteps", "env_wrapper"}
+    model = ALGORITHMS[algo](env=env, dataset=record_three_steps(env), device="cpu", **given)
+    assert (model.context_length, model.policy.options.n_layers) == (20, 10)
+    env.close()
 
 
 def test_the_packaged_settings_name_data_and_steps_only():
