@@ -83,7 +83,8 @@ def check_row(row: Any) -> Row:
     if missing or unknown:
         found = [f"lacks {', '.join(missing)}"] if missing else []
         found += [f"has the unknown {', '.join(unknown)}"] if unknown else []
-        raise RowError(f"{' and '.join(found)}; expected are {', '.join(KEYS)}.")
+        cure = "Rename the keys of rows that another version wrote, or move the file away and run its cells again"
+        raise RowError(f"{' and '.join(found)}; expected are {', '.join(KEYS)}. {cure}.")
     for key, types in {**KEYS, **OPTIONAL_KEYS}.items():
         if key in row:
             _check_type(f"{key} is", row[key], types)
