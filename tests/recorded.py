@@ -1,11 +1,13 @@
 """One recorded dataset for the rooms that work through the command line, and a small training on it."""
 
+import json
 from pathlib import Path
 
 import pytest
 from stable_baselines3 import PPO
 
 from sb3_dtfm.cli.main import main
+from sb3_dtfm.zoo.resuming import CHECKPOINT, START
 
 DATASET_ID = "tests/halfcheetah/random-v0"
 TINY = {
@@ -18,6 +20,12 @@ def tiny_training(algo: str, *arguments: str) -> list[str]:
     """Four gradient steps on HalfCheetah, episodes of 20 steps."""
     tail = ["-params", TINY[algo], "batch_size:4", *arguments]
     return ["train", "--algo", algo, "--env", "HalfCheetah-v5", "-n", "4", "--env-kwargs", "max_episode_steps:20", *tail]
+
+
+def undo_checkpoints(run: Path) -> None:
+    """Leave a run as if it had been killed before its first checkpoint."""
+    (run / CHECKPOINT).unlink(missing_ok=True)
+    (run / START).write_text(json.dumps({**json.loads((run / START).read_text()), "has_checkpoint": False}))
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,7 @@ from sb3_dtfm.cli.main import main
 from sb3_dtfm.data import load_dataset
 from sb3_dtfm.finetuning import FinetunedDTFM, OnlineDTFM
 from sb3_dtfm.zoo.arguments import with_target_return
-from tests.recorded import DATASET_ID, tiny_training
+from tests.recorded import DATASET_ID, tiny_training, undo_checkpoints
 
 EVALUATIONS = ["--eval-freq", "10", "--eval-episodes", "2"]
 QUICK = ["n_envs:1", "learning_starts:10", "batch_size:8", "gradient_steps:1", "policy_kwargs:dict(net_arch=[16])"]
@@ -244,7 +244,7 @@ def test_a_run_that_ended_before_its_first_checkpoint_begins_anew(run, workplace
         patch.setattr(OnlineDTFM, "_collect", lambda *_: signal.raise_signal(signal.SIGINT))
         assert main([*command, "--eval-freq", "0"]) == 0
     online = workplace / "logs/dtfm/HalfCheetah-v5_2"
-    (online / "checkpoint.zip").unlink(missing_ok=True)
+    undo_checkpoints(online)
     n_updates = DTFM.load(online / "HalfCheetah-v5")._n_updates
     assert main(["finetune", "--resume", str(online)]) == 0
     model = DTFM.load(online / "HalfCheetah-v5")

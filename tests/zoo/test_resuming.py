@@ -1,6 +1,5 @@
 """`sb3-dtfm train --resume`: a run that was ended or killed becomes what it would have been."""
 
-import json
 import os
 import signal
 import subprocess
@@ -19,7 +18,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sb3_dtfm import DTFM
 from sb3_dtfm.cli.main import main
 from sb3_dtfm.zoo.resuming import CHECKPOINT, START
-from tests.recorded import DATASET_ID, tiny_training
+from tests.recorded import DATASET_ID, tiny_training, undo_checkpoints
 
 RUN = Path("logs/dtfm/HalfCheetah-v5_1")
 N_STEPS, SIGNAL_AT, KILL_AT = 40, 17, 26
@@ -219,9 +218,7 @@ def test_what_an_agent_knew_is_not_lost_with_a_run_that_was_killed_early(workpla
     agent = RUN / "HalfCheetah-v5.zip"
     assert main([*training((SIGNAL_AT, signal.SIGINT)), "-i", str(agent)]) == 0
     second = RUN.with_name("HalfCheetah-v5_2")
-    (second / CHECKPOINT).unlink()  # as if it had been killed before there was one
-    began = json.loads((second / START).read_text())
-    (second / START).write_text(json.dumps({**began, "has_checkpoint": False}))
+    undo_checkpoints(second)
     assert main(["train", "--resume", str(second)]) == 0
     model = DTFM.load(second / "HalfCheetah-v5.zip")  # which the same signal has interrupted again
     assert (model.num_timesteps, model._n_updates) == (SIGNAL_AT + 1, N_STEPS + SIGNAL_AT + 1)
