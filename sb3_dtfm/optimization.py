@@ -136,12 +136,12 @@ def explain_out_of_memory(device: th.device, sizes: Callable[[], str], n_bytes: 
     """
     :param device: where training runs
     :param sizes: tells the settings that decide how much is needed
-    :param n_bytes: a batch alone takes; more than the device has are refused before an operating system ends the process
+    :param n_bytes: needed at least; more than the device has are refused before an operating system ends the process
     :raises MemoryError: in place of any error of memory, with these settings
     """
     there = total_memory(device)
     if n_bytes > there:
-        found = f"A batch alone takes {n_bytes / 1e9:,.1f} GB, and {device} has {there / 1e9:,.1f}"
+        found = f"A gradient step takes at least {n_bytes / 1e9:,.1f} GB, and {device} has {there / 1e9:,.1f}"
         raise MemoryError(f"{found}: {sizes()}. Lower batch_size first.")
     try:
         yield

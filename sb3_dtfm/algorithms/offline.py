@@ -338,8 +338,7 @@ class OfflineAlgorithm(SequenceModel):
         start = time.perf_counter()
         generator = th.Generator(self.device).manual_seed(step_seed(self._training_seed, self._n_updates, NOISE))
         seed_default_generator(self.device, step_seed(self._training_seed, self._n_updates, DROPOUT, parallel.rank))
-        numbers = self.context_length * (self.policy.observation_dim + self.policy.action_dim)  # of a window
-        with explain_out_of_memory(self.device, self._sizes, 4 * self.batch_size * numbers), limit_threads(self._n_macs()):
+        with explain_out_of_memory(self.device, self._sizes, self._n_bytes()), limit_threads(self._n_macs()):
             self._gradient_step(next(batches), generator, parallel)
         self._training_seconds += time.perf_counter() - start
         self._timed_steps += 1
@@ -349,6 +348,13 @@ class OfflineAlgorithm(SequenceModel):
         own, sizes = self.policy.options, {"batch_size": self.batch_size, "context_length": self.context_length}
         sizes |= {"chunk_size": own.chunk_size, "embed_dim": own.embed_dim, "n_layers": own.n_layers}
         return ", ".join(f"{name}={value}" for name, value in sizes.items())
+
+    def _n_bytes(self) -> int:
+        """Memory of a gradient step, at least: its batch, and what blocks keep to be differentiated."""
+        own, policy = self.policy.options, self.policy
+        in_batch = 4 * (policy.observation_dim + policy.action_dim)
+        in_blocks = 2 * 8 * own.embed_dim * own.n_layers * own.tokens_per_step  # bfloat16: keys, values and the like
+        return self.batch_size * self.context_length * (in_batch + in_blocks // n_processes())
 
     def _n_macs(self) -> int:
         """Multiplications of a gradient step, forward and twice as many backward, without attention's."""
