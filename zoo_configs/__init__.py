@@ -10,7 +10,7 @@ def paper_settings(algo: str) -> dict[str, Any]:
     """
     The settings of the method's paper: `DTFM(env=env, dataset=dataset, **paper_settings("dtfm")).learn(150_000)`.
 
-    The environment's are not among them: the paper acts in `ReturnToGoWrapper(env, target_return, bound_return_to_go=False)`.
+    The environment is not among them: the paper's is `ReturnToGoWrapper(env, target_return, bound_return_to_go=False)`.
 
     :param algo: "dt" or "dtfm"
     :return: arguments of the class, `policy` among them
