@@ -12,7 +12,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.env_util import unwrap_wrapper
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.preprocessing import is_image_space_channels_first
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from stable_baselines3.common.vec_env import (
     VecEnv,
     VecFrameStack,
@@ -29,6 +29,8 @@ RETURN_TO_GO = "return_to_go"
 TIMESTEP = "timestep"
 # The camera of an environment that observes nothing but an image.
 IMAGE = "image"
+# Numbers of channels that images have.
+CHANNELS = (1, 3, 4)
 # In `info` after several actions: what was observed between them.
 BETWEEN = "observations_between"
 
@@ -46,6 +48,18 @@ def image_spaces(space: spaces.Space) -> dict[str, spaces.Box]:
 
 def _is_image(space: spaces.Box) -> bool:
     return space.dtype == np.uint8 and len(space.shape) == 3
+
+
+def check_image_shape(shape: tuple[int, ...], name: str) -> None:
+    """
+    Refuse an image whose channels cannot be told from height and width.
+
+    :param shape: (height, width, channels), or channels first
+    :param name: of the image, for the message
+    :raises ValueError: 1, 3 or 4 neither at the first nor at the last place, or at both
+    """
+    if (shape[0] in CHANNELS) == (shape[2] in CHANNELS):
+        raise ValueError(f"{name} has shape {shape}, expected 1, 3 or 4 channels, either first or last.")
 
 
 def channels_first(space: spaces.Box) -> spaces.Box:
@@ -83,6 +97,11 @@ def sort_observation_space(space: spaces.Space) -> spaces.Space:
             f"Observation space {space} is no image that can be used: height, width and channels of uint8 are expected, "
             "as a space of its own or as an entry of the Dict that the environment observes."
         )
+    if isinstance(space, spaces.Box) and len(space.shape) == 3 and {space.shape[0], space.shape[2]} & set(CHANNELS):
+        raise ValueError(
+            f"Observation space {space} looks like an image of {space.dtype}; images are uint8, 0 to 255. Scale them in a "
+            "wrapper, or flatten what is none: gymnasium.wrappers.FlattenObservation."
+        )
     if not isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
         raise ValueError(
             f"Observation space {space} cannot be flattened to a Box; "
@@ -112,11 +131,15 @@ def return_to_go_space(observation_space: spaces.Space, images: Mapping[str, spa
     :param observation_space: of the bare environment, or the flat one of a dataset's buffer
     :param images: of a dataset's buffer; those in `observation_space` by default
     :return: Dict of `observation` (O,) float32, `return_to_go` (1,) float32, `timestep` (1,) int64, and images by camera
-    :raises ValueError: `observation_space` cannot be flattened
+    :raises ValueError: `observation_space` cannot be flattened, or an image cannot be used
     """
     images = image_spaces(observation_space) if images is None else images
     if taken := {OBSERVATION, RETURN_TO_GO, TIMESTEP} & images.keys():
         raise ValueError(f"An image is called {', '.join(taken)}, as what ReturnToGoWrapper shows; give it another name.")
+    for camera, space in images.items():
+        check_image_shape(space.shape, f"The image {camera!r}")
+        if not is_image_space(space, check_channels=False):
+            raise ValueError(f"The image {camera!r} is {space}; bounds of 0 and 255 are expected.")
     return spaces.Dict(
         {
             OBSERVATION: flatten_observation_space(without_images(observation_space)),

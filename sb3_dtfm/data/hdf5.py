@@ -32,11 +32,23 @@ def read_hdf5(group: h5py.Group, name: str, where: str) -> np.ndarray:
         return values
 
 
-def open_hdf5(group: h5py.Group, name: str, where: str) -> tuple[h5py.h5d.DatasetID, tuple[int, ...], np.dtype]:
+def read_images(group: h5py.Group, name: str, where: str) -> np.ndarray | h5py.Dataset:
+    """
+    :param group: as for :func:`read_hdf5`, which says the rest too
+    :return: images as they are stored: an array, or the bytes of one file each, which are read one by one
+    """
+    data, _, dtype = open_hdf5(group, name, where, encoded=True)
+    return h5py.Dataset(data) if h5py.check_vlen_dtype(dtype) else read_hdf5(group, name, where)
+
+
+def open_hdf5(
+    group: h5py.Group, name: str, where: str, encoded: bool = False
+) -> tuple[h5py.h5d.DatasetID, tuple[int, ...], np.dtype]:
     """
     An array that may be read, its shape and its type.
 
     :param group: as for :func:`read_hdf5`, which says the rest too
+    :param encoded: accept strings of bytes, too
     """
     what = f"{where}: {name}"
     check_within(group, name, where)
@@ -48,9 +60,10 @@ def open_hdf5(group: h5py.Group, name: str, where: str) -> tuple[h5py.h5d.Datase
         if not _stored_within(data):  # what is there can change without a trace, or be what nobody meant to give away
             raise DatasetError(f"{what} lie in another file; one file that holds everything is accepted.")
         shape, dtype, n_stored = data.shape, data.dtype, data.get_storage_size()
-    if h5py.check_vlen_dtype(dtype) == np.uint8:
+    strings = h5py.check_vlen_dtype(dtype) == np.uint8
+    if strings and not encoded:
         raise DatasetError(f"{what} {STORED_AS_JPEG}")
-    check_real(dtype, what)
+    check_real(np.uint8 if strings else dtype, what)
     if not shape:
         raise DatasetError(f"{what} have shape {shape}; one entry for each step is expected.")
     n_bytes = math.prod(shape) * dtype.itemsize

@@ -33,7 +33,6 @@ from sb3_dtfm.data.flat import (
 from sb3_dtfm.data.observations import chosen_space, observed
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_space, wrap_dataset_errors
-from sb3_dtfm.envs.return_to_go import flatten_observation_space, image_spaces, without_images
 from sb3_dtfm.envs.success import reported_success
 
 # What one step of an episode that was written down step by step holds: Gymnasium's, SB3's, and the shortest.
@@ -357,15 +356,8 @@ def load_replay_buffer(
         outside of [-1, 1]; names the environment, the episode and the step
     """
     source = "replay buffer"
-    try:
-        shown = replay_buffer.observation_space
-        keys = observation_keys and [key for key in observation_keys if key not in image_spaces(shown)]
-        vectors = spaces.Box(0.0, 0.0, (1,), np.float32) if keys == [] else without_images(shown)
-        flat_space = flatten_observation_space(chosen_space(vectors, keys or None, source))
-    except DatasetError:
-        raise
-    except ValueError as error:
-        raise DatasetError(f"{source}: {error}") from error
+    shown = replay_buffer.observation_space
+    flat_space = chosen_space(shown, observation_keys, source).flat
     space = check_action_space(replay_buffer.action_space, source)
     n_steps = replay_buffer.size()
     order = (np.arange(n_steps) + (replay_buffer.pos if replay_buffer.full else 0)) % max(1, replay_buffer.buffer_size)

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import h5py
 import minari
 import numpy as np
-from gymnasium import spaces
 from minari.dataset._storages import get_minari_storage
 from minari.dataset.minari_dataset import parse_dataset_id
 from minari.serialization import deserialize_space
@@ -24,11 +23,11 @@ from sb3_dtfm.data.arrow import import_pyarrow
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, existing_file, files_below
 from sb3_dtfm.data.flat import fitted
-from sb3_dtfm.data.hdf5 import open_group, read_hdf5
-from sb3_dtfm.data.observations import ReadArray, chosen_space, flatten_chosen
+from sb3_dtfm.data.hdf5 import open_group, read_hdf5, read_images
+from sb3_dtfm.data.image_files import decode_images
+from sb3_dtfm.data.observations import Chosen, ReadArray, chosen_space, flatten_chosen
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, check_flags, wrap_dataset_errors
-from sb3_dtfm.envs.return_to_go import flatten_observation_space, image_spaces
 from sb3_dtfm.envs.success import SUCCESS
 
 METADATA_FILE_NAME, HDF5_FILE_NAME = "metadata.json", "main_data.hdf5"
@@ -100,7 +99,7 @@ def load_minari(
     Nothing that its metadata name is imported, built or run: of `env_spec` only the id is read.
 
     :param dataset: id (`namespace/name-vN`) or an opened dataset, whose choice of episodes is kept
-    :param observation_keys: which entries of dictionary observations make up the observation, in this order
+    :param observation_keys: which entries of dictionary observations, cameras too, make up the observation, in this order
     :param clip_actions: bring actions outside of the dataset's action space to the nearest bound
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
     :param storage: where the steps go, memory if not given
@@ -117,19 +116,19 @@ def load_minari(
         raise DatasetError(f"{source}: holds no episode; at least one is needed.")
     with contextlib.ExitStack() as stack, wrap_dataset_errors(source):
         env_spec = dataset.env_spec
-        observation_space, action_space = _space(dataset.observation_space, observation_keys, source), dataset.action_space
+        chosen, action_space = chosen_space(dataset.observation_space, observation_keys, source), dataset.action_space
         read = _hdf5_reader(stack, folder, source) if in_hdf5 else _arrow_reader(dataset.storage.FORMAT, folder, source)
 
         def trajectory(index: int) -> Trajectory:
             name = f"episode {index}"
             with wrap_dataset_errors(f"{source}, {name}"):
-                found = make_trajectory(*read(index), observation_keys, observation_space, name, source)
+                found = make_trajectory(*read(index), chosen, name, source)
                 return replace(found, actions=fitted(found.actions, action_space, clip_actions))
 
         buffer = TrajectoryBuffer.from_trajectories(
             map(trajectory, dataset.episode_indices.tolist()),
             action_space,
-            flatten_observation_space(observation_space),
+            chosen.flat,
             n_steps=dataset.total_steps,
             source=source,
             score_reference=_score_reference(metadata),
@@ -259,21 +258,6 @@ def _n_episodes(folder: Path, data_format: str, dataset_id: str) -> int:
             return sum(name.startswith("episode_") for name in file)
 
 
-def _space(space: spaces.Space, keys: Sequence[str] | None, source: str) -> spaces.Space:
-    cameras = [camera for camera in image_spaces(space) if keys is None or camera in keys]
-    if cameras:
-        raise DatasetError(
-            f"{source}: images of {', '.join(cameras)} are not read from Minari datasets; observation_keys=[...] chooses "
-            "vectors."
-        )
-    try:
-        return chosen_space(space, keys, source)
-    except DatasetError:
-        raise
-    except ValueError as error:
-        raise DatasetError(f"{source}: {error}") from error
-
-
 def _score_reference(metadata: dict[str, Any]) -> ScoreReference | None:
     """The scale of normalised scores that a dataset's metadata holds, if it holds one that can be used."""
     minimum, maximum = metadata.get("ref_min_score"), metadata.get("ref_max_score")
@@ -284,9 +268,16 @@ def _score_reference(metadata: dict[str, Any]) -> ScoreReference | None:
 
 
 class _Episode(NamedTuple):
-    """What reads an episode's arrays, and the infos' success, a flag a step, None where there is none."""
+    """
+    :param read: gives an array of observations, actions, rewards, terminations, truncations; a part of a Dict or Tuple by
+        its keys
+    :param read_images: gives images of observations as they are stored: an array, or the bytes of a file each
+    :param success: flags of the steps, whose last one tells of the episode, after one of its reset or not; None where
+        nothing is told
+    """
 
     read: ReadArray
+    read_images: ReadArray
     success: np.ndarray | None
 
 
@@ -307,7 +298,7 @@ def _hdf5_reader(stack: contextlib.ExitStack, folder: Path, source: str) -> Call
         def array(*path: str | int) -> np.ndarray:
             return read_hdf5(group, "/".join(f"_index_{key}" if isinstance(key, int) else key for key in path), where)
 
-        return _Episode(array, array(told) if told else None)
+        return _Episode(array, lambda *path: read_images(group, "/".join(path), where), array(told) if told else None)
 
     return episode
 
@@ -343,28 +334,19 @@ def _arrow_reader(data_format: str, folder: Path, source: str) -> Callable[[int]
                     return values.to_numpy(zero_copy_only=False)
                 return values.flatten().to_numpy(zero_copy_only=False).reshape(len(values), -1)
 
-        return _Episode(array, array(INFOS) if told else None)
+        return _Episode(array, array, array(INFOS) if told else None)
 
     return episode
 
 
 def make_trajectory(
-    read: ReadArray,
-    success: np.ndarray | None,
-    observation_keys: Sequence[str] | None,
-    observation_space: spaces.Space,
-    name: str,
-    source: str,
+    read: ReadArray, read_images: ReadArray, success: np.ndarray | None, chosen: Chosen, name: str, source: str
 ) -> Trajectory:
     """
     One episode of a Minari file.
 
-    :param read: gives an array of observations, actions, rewards, terminations, truncations; a part of a Dict or Tuple
-        by its keys
-    :param success: flags of the steps, whose last one tells of the episode, after one of its reset or not; None where
-        nothing is told
-    :param observation_keys: as for :func:`load_minari`
-    :param observation_space: of what is chosen of the dataset's, sorted
+    :param read: see :class:`_Episode`, for the next two, too
+    :param chosen: what is observed
     :param name: what the file calls the episode
     :param source: the file, for messages
     :raises DatasetError: one of its arrays is missing, or they differ in length
@@ -374,8 +356,9 @@ def make_trajectory(
     n_steps = len(rewards)
     if len(actions) != n_steps:
         raise DatasetError(f"{where}: holds {len(actions)} actions for {n_steps} rewards; as many are expected.")
-    columns = flatten_chosen(read, observation_keys, observation_space, where)
-    counts = sorted({len(column) for column in columns})
+    columns = flatten_chosen(read, chosen, where)
+    stored = {each: read_images("observations", *(() if chosen.alone else (each,))) for each in chosen.cameras}
+    counts = sorted({len(each) for each in (*columns, *stored.values())})
     if len(counts) != 1 or counts[0] - n_steps not in (0, 1):
         raise DatasetError(
             f"{where}: holds {' and '.join(map(str, counts))} observations for {n_steps} rewards; "
@@ -384,8 +367,13 @@ def make_trajectory(
     terminations, truncations = (
         check_flags(read(key), n_steps, f"{where}: {key}") for key in ("terminations", "truncations")
     )
+    columns = columns or [np.zeros((n_steps, 1), np.float32)]
     return Trajectory(
         observations=np.concatenate(columns, axis=1)[:n_steps] if len(columns) > 1 else columns[0][:n_steps],
+        images={
+            camera: _images(stored[camera], n_steps, space.shape, f"{where}: {camera}")
+            for camera, space in chosen.cameras.items()
+        },
         actions=actions,
         rewards=rewards,
         terminated=bool(terminations[-1:].any()),
@@ -393,3 +381,20 @@ def make_trajectory(
         success=None if success is None else bool(check_flags(success, len(success), f"{where}: success")[-1:].any()),
         name=name,
     )
+
+
+def _images(stored: np.ndarray, n_steps: int, shape: tuple[int, ...], where: str) -> np.ndarray:
+    """
+    :param stored: (T, ...) or (T + 1, ...), bytes of images; or files of images: Minari 0.5.3 makes a JPEG of nearly every
+        one, 0.5.4 unless it is told otherwise
+    :param n_steps: T
+    :param shape: of an image
+    :return: (T, ...)
+    """
+    if isinstance(stored, np.ndarray) and stored.shape[1:] in (shape, (math.prod(shape),)):
+        if stored.dtype != np.uint8:
+            raise DatasetError(f"{where} hold {stored.dtype}; uint8 is expected.")
+        return stored[:n_steps].reshape(n_steps, *shape)
+    if (stored.dtype != np.uint8 and stored.dtype != object) or stored.ndim > 2:
+        raise DatasetError(f"{where} have shape {stored.shape}, expected (steps, {', '.join(map(str, shape))}).")
+    return decode_images(stored, n_steps, shape, where)

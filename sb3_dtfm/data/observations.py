@@ -9,7 +9,13 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_dtfm.data.trajectories import DatasetError, check_real
-from sb3_dtfm.envs.return_to_go import IMAGE, sort_observation_space, without_images
+from sb3_dtfm.envs.return_to_go import (
+    IMAGE,
+    flatten_observation_space,
+    image_spaces,
+    sort_observation_space,
+    without_images,
+)
 
 # How a JPEG image begins.
 JPEG = b"\xff\xd8\xff"
@@ -144,36 +150,65 @@ def part_of(space: spaces.Space | None, key: str) -> spaces.Space | None:
     return space.spaces.get(key) if isinstance(space, spaces.Dict) else None
 
 
-def chosen_space(space: spaces.Space, keys: Sequence[str] | None, source: str) -> spaces.Space:
+class Chosen(NamedTuple):
     """
-    The observation space that is left of a dataset's own one.
+    What is observed of a dataset's own space.
+
+    :param cameras: the spaces of its images, by camera
+    :param keys: of the other entries of a Dict, in this order; None for all
+    :param vectors: the space of these entries, sorted; None of images alone
+    :param alone: an image is all that is observed, and no entry of a Dict
+    """
+
+    cameras: dict[str, spaces.Box]
+    keys: list[str] | None
+    vectors: spaces.Space | None
+    alone: bool
+
+    @property
+    def flat(self) -> spaces.Box:
+        """The space of the vector that they become: without vectors a single number that is always 0."""
+        return flatten_observation_space(self.vectors or without_images(spaces.Dict(dict(self.cameras))))
+
+
+def chosen_space(space: spaces.Space, keys: Sequence[str] | None, source: str) -> Chosen:
+    """
+    What is left of a dataset's observation space.
 
     :param space: of the dataset
-    :param keys: of a Dict's entries, in this order; None for all of the space
+    :param keys: of a Dict's entries, cameras too, in this order; None for all of the space
     :param source: for messages
-    :raises DatasetError: no Dict, or no such entry
+    :raises DatasetError: no Dict, or no such entry, or none that can be used
     """
-    if keys is None:
-        return sort_observation_space(space)
-    there = space.spaces if isinstance(space, spaces.Dict) else {}
-    missing = [key for key in keys if key not in there]
-    if missing or not keys:
+    cameras = image_spaces(space)
+    there: Mapping[str, spaces.Space] = space.spaces if isinstance(space, spaces.Dict) else cameras
+    if keys is not None and (not keys or set(keys) - set(there)):
         found = f"entries {', '.join(sorted(there))}" if there else f"no entries, but {space}"
         raise DatasetError(f"{source}: observation_keys is {list(keys)}; the observations have {found}.")
-    return sort_observation_space(spaces.Tuple([there[key] for key in keys]))
+    alone = not isinstance(space, spaces.Dict)
+    try:
+        if keys is None:
+            vectors = None if len(cameras) == len(there) > 0 else sort_observation_space(without_images(space))
+            return Chosen(cameras, None, vectors, alone)
+        others = [key for key in keys if key not in cameras]
+        vectors = sort_observation_space(spaces.Tuple([there[key] for key in others])) if others else None
+        return Chosen({key: cameras[key] for key in keys if key in cameras}, others, vectors, alone)
+    except ValueError as error:
+        raise DatasetError(f"{source}: {error}") from error
 
 
-def flatten_chosen(read: ReadArray, keys: Sequence[str] | None, space: spaces.Space, where: str) -> list[np.ndarray]:
+def flatten_chosen(read: ReadArray, chosen: Chosen, where: str) -> list[np.ndarray]:
     """
-    As :func:`flatten_observations`, of the entries that were chosen.
+    As :func:`flatten_observations`, of the vectors that were chosen.
 
-    :param keys: as for :func:`chosen_space`
-    :param space: what :func:`chosen_space` has made of the dataset's
+    :param chosen: of the dataset's space
     """
-    if keys is None:
-        return flatten_observations(read, ("observations",), space, where)
-    assert isinstance(space, spaces.Tuple)
-    parts = zip(keys, space.spaces, strict=True)
+    if chosen.vectors is None:
+        return []
+    if chosen.keys is None:
+        return flatten_observations(read, ("observations",), chosen.vectors, where)
+    assert isinstance(chosen.vectors, spaces.Tuple)
+    parts = zip(chosen.keys, chosen.vectors.spaces, strict=True)
     columns = (flatten_observations(read, ("observations", key), part, where) for key, part in parts)
     return list(itertools.chain.from_iterable(columns))
 

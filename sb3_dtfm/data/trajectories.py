@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_dtfm.actions import ActionSpace
+from sb3_dtfm.envs.return_to_go import check_image_shape
 
 # Recorded float64 actions may pass a float32 bound by a rounding error; beyond this share of the range they are wrong.
 ACTION_TOLERANCE = 1e-4
@@ -303,11 +303,10 @@ def check_images(
             )
         if len(array) != n_steps:
             raise DatasetError(f"{where}: has {len(array)} images of {camera!r}, expected {n_steps}, one for each action.")
-        space = spaces.Box(0, 255, array.shape[1:], np.uint8)
-        if not is_image_space(space, check_channels=True):
-            raise DatasetError(
-                f"{where}: images of {camera!r} have shape {array.shape[1:]}, expected 1, 3 or 4 channels, first or last."
-            )
+        try:
+            check_image_shape(array.shape[1:], f"an image of {camera!r}")
+        except ValueError as error:
+            raise DatasetError(f"{where}: {error}") from error
         if image_spaces is not None and array.shape[1:] != image_spaces[camera].shape:
             before = image_spaces[camera].shape
             raise DatasetError(

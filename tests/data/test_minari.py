@@ -1,5 +1,6 @@
 """Reading Minari datasets that Minari itself has written."""
 
+import io
 import json
 import shutil
 import time
@@ -12,9 +13,11 @@ import h5py
 import minari
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
 from minari.data_collector import EpisodeBuffer
 from packaging.version import Version
+from PIL import Image
 
 from sb3_dtfm.data import DatasetError, load_minari
 from sb3_dtfm.envs import ReturnToGoWrapper, register_gymnasium_robotics, return_to_go_space
@@ -290,11 +293,77 @@ def test_only_bounded_box_actions_are_accepted(space: spaces.Space, actions: np.
         load_minari(dataset)
 
 
-def test_images_are_refused():
-    images = np.zeros((4, 40, 40, 3), np.uint8)
-    dataset = write([make_episode(3, observations=images)], observation_space=spaces.Box(0, 255, (40, 40, 3), np.uint8))
-    with pytest.raises(DatasetError, match=r"test/set-v0.*images of image are not read from Minari datasets"):
-        load_minari(dataset)
+PICTURES = spaces.Dict(
+    {
+        "b": spaces.Box(-9, 9, (2,)),
+        "hand": spaces.Box(0, 255, (40, 48, 3), np.uint8),
+        "first": spaces.Box(0, 255, (3, 40, 48), np.uint8),
+        "a": spaces.Box(-9, 9, (1,)),
+    }
+)
+
+
+def pictures(n_steps: int) -> dict[str, np.ndarray]:
+    """What a camera sees is smooth, so that JPEG changes it little; rows and columns tell which way up it is."""
+    rows, columns = np.mgrid[:40, :48]
+    hand = np.stack([np.stack([5 * rows, 5 * columns, np.full_like(rows, 9 * step)], axis=2) for step in range(n_steps + 1)])
+    seen = {"hand": hand.astype(np.uint8), "first": np.moveaxis(hand, 3, 1).astype(np.uint8)}
+    vectors = {"a": np.arange(n_steps + 1.0)[:, None], "b": np.ones((n_steps + 1, 2))}
+    return {**seen, **{name: each.astype(np.float32) for name, each in vectors.items()}}
+
+
+@pytest.mark.parametrize("data_format", ["hdf5", "arrow", "parquet"])
+def test_images_come_back_as_minari_itself_reads_them(data_format: str):
+    seen = pictures(6)
+    dataset = write([make_episode(6, observations=seen)], observation_space=PICTURES, data_format=data_format)
+    buffer = load_minari("test/set-v0")
+    read = next(iter(dataset)).observations
+    for camera in ("first", "hand"):
+        np.testing.assert_array_equal(buffer.own(camera), np.reshape(read[camera], (7, *PICTURES[camera].shape))[:6])
+        assert np.abs(buffer.own(camera).numpy().astype(int) - seen[camera][:6]).max() < 12, "JPEG, upright"
+    assert buffer.own("hand").dtype == buffer.own("first").dtype == th.uint8
+    np.testing.assert_array_equal(buffer.observations, np.hstack([seen["a"], seen["b"]])[:6])
+    chosen = load_minari("test/set-v0", observation_keys=["b", "hand"])
+    assert list(chosen.image_spaces) == ["hand"]
+    np.testing.assert_array_equal(chosen.observations, seen["b"][:6])
+    assert load_minari("test/set-v0", observation_keys=["hand"]).observations.tolist() == [[0.0]] * 6
+    with pytest.raises(
+        DatasetError, match=r"observation_keys is \['wrist'\]; the observations have entries a, b, first, hand"
+    ):
+        load_minari("test/set-v0", observation_keys=["wrist"])
+
+
+@pytest.mark.parametrize("data_format", ["hdf5", "arrow"])
+def test_images_that_are_stored_as_they_are(data_format: str):
+    """By Minari 0.5.4 if it is told to; by 0.5.3 those that are none by its own rule, channels first for example."""
+    images = pictures(4)["hand"]
+    if Version(minari.__version__) >= Version("0.5.4"):
+        space, kwargs = PICTURES["hand"], {"jpeg_encoding": False}
+    else:
+        images, space, kwargs = np.moveaxis(images, 3, 1), PICTURES["first"], {}
+    episode = make_episode(4, observations=images)
+    buffer = load_minari(write([episode], observation_space=space, data_format=data_format, **kwargs))
+    np.testing.assert_array_equal(buffer.own("image"), images[:4])
+
+
+def test_damaged_images_are_named():
+    dataset = write([make_episode(6, observations=pictures(6))], observation_space=PICTURES)
+    with h5py.File(data_file(dataset), "a") as file:
+        frames = list(file["episode_0/observations/hand"])
+        larger = io.BytesIO()
+        Image.fromarray(np.zeros((50, 48, 3), np.uint8)).save(larger, "JPEG")
+    for damage, message in {
+        b"no image": "episode 0: hand, step 2: cannot be read .*; the image is no JPEG or PNG, or damaged",
+        bytes(frames[2])[:200]: "episode 0: hand, step 2: cannot be read .*(?i:truncated)",
+        larger.getvalue(): r"episode 0: hand, step 2: the image is RGB of 50 x 48 pixels, expected \(40, 48, 3\)",
+    }.items():
+        with h5py.File(data_file(dataset), "a") as file:
+            del file["episode_0/observations/hand"]
+            found = file.create_dataset("episode_0/observations/hand", (7,), h5py.vlen_dtype(np.uint8))
+            for number, frame in enumerate(frames):
+                found[number] = np.frombuffer(damage, np.uint8) if number == 2 else frame
+        with pytest.raises(DatasetError, match=message):
+            load_minari("test/set-v0")
 
 
 def change_metadata(dataset: minari.MinariDataset, **changes: Any) -> None:

@@ -196,7 +196,7 @@ def test_unfit_images_are_refused(episodes, buffer):
         DatasetError, match=r"episode 3: images of 'pixels' have shape \(16, 32, 3\), expected \(32, 32, 3\)"
     ):
         load_dataset([*episodes[:3], *change(episodes[3:], lambda image: image[::2])], **BOUNDS)
-    with pytest.raises(DatasetError, match="expected 1, 3 or 4 channels, first or last"):
+    with pytest.raises(DatasetError, match="expected 1, 3 or 4 channels, either first or last"):
         load_dataset(change(episodes, lambda image: np.concatenate([image, image], axis=2)), **BOUNDS)
     with pytest.raises(DatasetError, match=r"images \{'pixels': \(3, 32, 32\)\}, the environment's are of no camera"):
         make(DT, buffer, env=ReturnToGoWrapper(record_env_without_images(), target_return=0.0))
