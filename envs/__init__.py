@@ -7,6 +7,7 @@ from sb3_dtfm.envs.robosuite.registration import register_robosuite_envs
 from sb3_dtfm.envs.robotics import AdroitReward, register_gymnasium_robotics, warn_of_reward
 
 if TYPE_CHECKING:
+    from sb3_dtfm.envs.cameras import RenderWrapper, resize_image
     from sb3_dtfm.envs.return_to_go import (
         BETWEEN,
         OBSERVATION,
@@ -32,6 +33,7 @@ __all__ = [
     "RETURN_TO_GO",
     "TIMESTEP",
     "AdroitReward",
+    "RenderWrapper",
     "ReturnToGoWrapper",
     "channels_first",
     "check_vec_env",
@@ -42,6 +44,7 @@ __all__ = [
     "register_go1_env",
     "register_gymnasium_robotics",
     "register_robosuite_envs",
+    "resize_image",
     "return_to_go_space",
     "share_target_return",
     "warn_of_reward",
@@ -52,6 +55,6 @@ def __getattr__(name: str) -> Any:
     """The wrapper and what comes with it, when they are asked for: Stable-Baselines3 takes seconds to import."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from sb3_dtfm.envs import return_to_go
+    from sb3_dtfm.envs import cameras, return_to_go
 
-    return getattr(return_to_go, name)
+    return getattr(cameras if hasattr(cameras, name) else return_to_go, name)

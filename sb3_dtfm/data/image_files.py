@@ -7,6 +7,7 @@ import numpy as np
 from PIL import Image
 
 from sb3_dtfm.data.trajectories import DatasetError, wrap_dataset_errors
+from sb3_dtfm.envs.cameras import resize_image
 
 # What is read; others have decoders that few have looked at.
 FORMATS = ("JPEG", "PNG")
@@ -14,19 +15,22 @@ FORMATS = ("JPEG", "PNG")
 CHANNELS = {"L": 1, "RGB": 3, "RGBA": 4}
 
 
-def decode_images(encoded: Any, n_steps: int, shape: tuple[int, ...], where: str) -> np.ndarray:
+def decode_images(
+    encoded: Any, n_steps: int, shape: tuple[int, ...], where: str, size: tuple[int, int] | None = None
+) -> np.ndarray:
     """
     :param encoded: gives at least T images by their number, the bytes of a JPEG or PNG file each
     :param n_steps: T
     :param shape: (height, width, channels) that each must have
     :param where: the file, the episode and the camera
+    :param size: (height, width) that all are brought to; None keeps them
     :return: (T, height, width, channels) uint8
     :raises DatasetError: names the first step whose image is damaged or has another shape
     """
-    images = np.empty((n_steps, *shape), np.uint8)
+    images = np.empty((n_steps, *(size or shape[:2]), shape[2]), np.uint8)
     for step in range(n_steps):
         with wrap_dataset_errors(f"{where}, step {step}", "the image is no JPEG or PNG, or damaged"):
-            images[step] = _decode(bytes(encoded[step]), shape, f"{where}, step {step}")
+            images[step] = resize_image(_decode(bytes(encoded[step]), shape, f"{where}, step {step}"), size)
     return images
 
 

@@ -3,26 +3,25 @@
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sb3_dtfm.actions import ActionSpace
-from sb3_dtfm.arguments import COUNT
-from sb3_dtfm.data.arrow import as_numbers, import_pyarrow
+from sb3_dtfm.arguments import COUNT, Number
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, files_below
 from sb3_dtfm.data.flat import bounded_space, fitted, json_options, warn_of_made_up_rewards
+from sb3_dtfm.data.lerobot_images import DATA, EPISODE, FRAME, IMAGE, INFO, TIME, VIDEO, Cameras, Columns
 from sb3_dtfm.data.storage import FileStorage
-from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_flags, check_size, wrap_dataset_errors
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_flags, wrap_dataset_errors
 
-INFO, DATA = "meta/info.json", "data"
 ACTION, REWARD, SUCCESS, DONE = "action", "next.reward", "next.success", "next.done"
-EPISODE, FRAME = "episode_index", "frame_index"
 OBSERVATION = "observation."
-# What numbers of a robot are stored as; images, videos and words are others.
+PIXELS = Number(low=1, whole=True)
+# What numbers of a robot are stored as; words are others.
 NUMBERS = ("float32", "float64", "float16", "int64", "int32", "bool")
 
 
@@ -44,7 +43,8 @@ def fingerprint_lerobot(path: str | os.PathLike[str], options: dict[str, Any]) -
 
 def load_lerobot(
     path: str | os.PathLike[str],
-    observation_keys: Sequence[str] | None = None,
+    observation_keys: Sequence[str] | Mapping[str, str] | None = None,
+    image_size: Sequence[int] | None = None,
     episodes: Sequence[int] | None = None,
     action_bounds: Sequence[Any] | None = None,
     clip_actions: bool = False,
@@ -55,12 +55,16 @@ def load_lerobot(
     """
     The episodes of a LeRobot dataset, of its formats 2.0 to 3.0: `meta/info.json`, and parquet files below `data`.
 
-    The observation is made of all vectors of numbers whose names begin with `observation.`, in the order of their names;
-    images and videos are left out. Rewards are `next.reward`, or else 1 at the first step of `next.success`, or else 1 at
-    the last step of every episode. The numbers of all episodes are read into memory.
+    The observation is made of all features whose names begin with `observation.`: vectors of numbers in the order of their
+    names, images, and the frames of videos at the steps' timestamps. Rewards are `next.reward`, or else 1 at the first step
+    of `next.success`, or else 1 at the last step of every episode. The numbers of all episodes are read into memory; images
+    are read episode by episode.
 
     :param path: the folder
-    :param observation_keys: which features make up the observation, in this order, as `observation.state`
+    :param observation_keys: which features make up the observation, in this order, as `observation.state`; or what the
+        environment calls each of them, `{"pixels": "observation.image", "agent_pos": "observation.state"}`
+    :param image_size: (height, width) that all images are brought to, see :func:`~sb3_dtfm.envs.resize_image`; None keeps
+        them as they are
     :param episodes: numbers of the episodes to read, in this order; all if not given
     :param action_bounds: smallest and largest action, numbers or (A,) each; where they are not given, those of
         `action_space`, or what has been recorded
@@ -73,33 +77,33 @@ def load_lerobot(
     """
     folder = Path(path).expanduser()
     source = str(folder)
-    features, told = _info(folder, source)
-    keys = list(observation_keys or sorted(name for name in features if name.startswith(OBSERVATION)))
-    for name in (*keys, ACTION):
-        if name not in features:
-            raise DatasetError(f"{source}: has no feature {name!r} of numbers, only {', '.join(sorted(features))}.")
-    if not keys:
-        raise DatasetError(
-            f"{source}: no feature of numbers begins with {OBSERVATION!r}, only {', '.join(sorted(features))}."
-        )
-    labels = [name for name in (REWARD, SUCCESS, DONE) if name in features]
-    columns, n_stored = _read(folder, [*keys, ACTION, *labels, EPISODE, FRAME], told["total_frames"], source)
+    info = _info(folder, source)
+    features = {name: each["dtype"] for name, each in info["features"].items()}
+    names = _names(observation_keys, features, source)
+    cameras = {name: key for name, key in names.items() if features[key] in (IMAGE, VIDEO)}
+    vectors = [key for name, key in names.items() if name not in cameras]
+    labels = [name for name in (REWARD, SUCCESS, DONE, TIME) if features.get(name) in NUMBERS]
+    stored = Columns(folder, DATA, [*vectors, ACTION, *labels, EPISODE, FRAME], source)
+    columns, n_frames, n_episodes = stored.numbers, info["total_frames"], info["total_episodes"]
+    if len(stored) != n_frames:
+        raise DatasetError(f"{source}: {INFO} tells of {n_frames} frames; there are {len(stored)}.")
     _check_labels(columns, labels, source)
+    size = None if image_size is None else _size(image_size)
+    images = Cameras(folder, info, list(cameras.values()), stored.files, size, source)
     order = np.lexsort((columns[FRAME][:, 0], columns[EPISODE][:, 0]))
     columns = {name: values[order] for name, values in columns.items()}
     numbers, starts = np.unique(columns[EPISODE][:, 0], return_index=True)
     stops = np.append(starts[1:], len(order))
-    if len(numbers) != told["total_episodes"]:
-        told_of = f"{INFO} tells of {told['total_episodes']} episodes"
-        raise DatasetError(f"{source}: {told_of}; there are {len(numbers)}.")
-    if not labels or labels == [DONE]:
+    if len(numbers) != n_episodes:
+        raise DatasetError(f"{source}: {INFO} tells of {n_episodes} episodes; there are {len(numbers)}.")
+    if not {REWARD, SUCCESS} & set(labels):
         warn_of_made_up_rewards((), source)
     wanted = range(len(numbers)) if episodes is None else [_place(number, numbers, source) for number in episodes]
     actions = columns[ACTION]
     if action_bounds is None and action_space is None:
         action_bounds = _recorded(actions)
     space = bounded_space(action_bounds, action_space, actions, source)
-    observations = np.concatenate([columns[key] for key in keys], axis=1)
+    observations = np.concatenate([columns[key] for key in vectors] or [np.zeros((len(order), 1))], axis=1)
     actions = fitted(actions, space, clip_actions)
 
     def trajectory(place: int) -> Trajectory:
@@ -108,23 +112,17 @@ def load_lerobot(
         frames = columns[FRAME][steps, 0]
         if not np.array_equal(frames, np.arange(stop - start)):
             raise DatasetError(f"{source}, episode {number}: {FRAME} does not count its {stop - start} frames from 0 on.")
-        success = columns[SUCCESS][steps, 0] > 0 if SUCCESS in columns else None
-        if REWARD in columns:
-            rewards = columns[REWARD][steps, 0]
-            ended = success if success is not None else columns.get(DONE, np.zeros((len(order), 1)))[steps, 0]
-            terminated = bool(ended[-1])
-        else:
-            marks = np.eye(1, stop - start, stop - start - 1)[0] if success is None else success
-            terminated = bool(marks.any())
-            steps = slice(start, start + int(np.argmax(marks)) + 1 if terminated else stop)
-            rewards = marks[: steps.stop - start].astype(float)
+        rewards, terminated, success = _rewards({name: columns[name][steps, 0] for name in labels}, stop - start)
+        steps = slice(start, start + len(rewards))
+        times = columns[TIME][steps, 0] if TIME in columns else frames[: len(rewards)] / info.get("fps", 1)
         return Trajectory(
             observations=observations[steps],
+            images={name: images.read(key, number, order[steps], times) for name, key in cameras.items()},
             actions=actions[steps],
             rewards=rewards,
             terminated=terminated,
             truncated=not terminated,
-            success=None if success is None else bool(success.any()),
+            success=success,
             name=f"episode {number}",
         )
 
@@ -135,23 +133,49 @@ def load_lerobot(
         source=source,
         storage=storage,
         on_invalid=on_invalid,
-        n_stored=n_stored,
+        n_stored=stored.n_stored,
     )
 
 
-def _info(folder: Path, source: str) -> tuple[dict[str, tuple[int, ...]], dict[str, int]]:
-    """Shapes of the features that are numbers, and how many frames and episodes there should be."""
+def _info(folder: Path, source: str) -> dict[str, Any]:
+    """What the dataset says of itself, so far as that is needed."""
     with wrap_dataset_errors(f"{source}: {INFO}"):
         (path,) = (path for path in files_below(folder, "meta") if path == folder / INFO)
-        info = json.loads(path.read_text())
+        info: dict[str, Any] = json.loads(path.read_text())
         version = info.get("codebase_version")
         if not re.fullmatch(r"v[23]\.\d+", str(version)):
             raise DatasetError(f"{source}: {INFO}: codebase_version is {version!r:.20}; formats v2.0 to v3.0 are read.")
-        told = {name: info[name] for name in ("total_frames", "total_episodes")}
-        for name, count in told.items():
-            if not COUNT.accepts(count):
-                raise DatasetError(f"{source}: {INFO}: {name} is {count!r:.20}; {COUNT} is expected.")
-        return {name: tuple(each["shape"]) for name, each in info["features"].items() if each["dtype"] in NUMBERS}, told
+        for name in ("total_frames", "total_episodes"):
+            if not COUNT.accepts(info[name]):
+                raise DatasetError(f"{source}: {INFO}: {name} is {info[name]!r:.20}; {COUNT} is expected.")
+        for name, each in info["features"].items():
+            if not isinstance(each["dtype"], str):
+                raise DatasetError(f"{source}: {INFO}: dtype of {name} is {each['dtype']!r:.20}; a word is expected.")
+        return info
+
+
+def _names(keys: Sequence[str] | Mapping[str, str] | None, features: Mapping[str, str], source: str) -> dict[str, str]:
+    """The features that are observed, by the names that they have in the observation."""
+    known = sorted(name for name, dtype in features.items() if dtype in (*NUMBERS, IMAGE, VIDEO))
+    chosen = [name for name in known if name.startswith(OBSERVATION)] if keys is None else keys
+    # The environment shows its entries in the order of their names.
+    names = dict(sorted(chosen.items())) if isinstance(chosen, Mapping) else {name: name for name in chosen}
+    for name in names.values():
+        if name not in known:
+            raise DatasetError(f"{source}: has no feature {name!r} of numbers or images, only {', '.join(known)}.")
+    if features.get(ACTION) not in NUMBERS:
+        raise DatasetError(f"{source}: has no feature {ACTION!r} of numbers, only {', '.join(known)}.")
+    if not names:
+        raise DatasetError(
+            f"{source}: no feature of numbers or images begins with {OBSERVATION!r}, only {', '.join(known)}."
+        )
+    return names
+
+
+def _size(size: Any) -> tuple[int, int]:
+    if not (isinstance(size, Sequence) and len(size) == 2 and all(PIXELS.accepts(each) for each in size)):
+        raise ValueError(f"image_size must be height and width, pixels, got {size!r}.")
+    return size[0], size[1]
 
 
 def _check_labels(columns: dict[str, np.ndarray], labels: Sequence[str], source: str) -> None:
@@ -159,43 +183,26 @@ def _check_labels(columns: dict[str, np.ndarray], labels: Sequence[str], source:
     for name in (*labels, EPISODE, FRAME):
         if columns[name].shape[1] != 1:
             raise DatasetError(f"{source}: {name} has {columns[name].shape[1]} numbers a frame; one is expected.")
-    for name in set(labels) - {REWARD}:
+    for name in set(labels) - {REWARD, TIME}:
         check_flags(columns[name], len(columns[name]), f"{source}: {name}")
     odd = columns[EPISODE] % 1 != 0
     if odd.any():
         raise DatasetError(f"{source}: {EPISODE} is {columns[EPISODE][odd][0]}; whole numbers are expected.")
 
 
-def _read(folder: Path, names: Sequence[str], n_frames: int, source: str) -> tuple[dict[str, np.ndarray], int]:
+def _rewards(labels: dict[str, np.ndarray], n_steps: int) -> tuple[np.ndarray, bool, bool | None]:
     """
-    The columns of all parquet files, (N, .) each, and how many bytes are stored of them.
-
-    :param names: of the columns
-    :param n_frames: N, as the dataset tells
+    :param labels: (T,) each, of an episode, by the names of their columns
+    :param n_steps: T
+    :return: rewards of all steps, or up to the success; whether the task was done then, and whether it ever was
     """
-    paths = [path for path in files_below(folder, DATA) if path.suffix == ".parquet"]
-    if not paths:
-        raise DatasetError(f"{source}: there is no parquet file below {DATA}.")
-    pyarrow = import_pyarrow(source)
-    n_stored = sum(path.stat().st_size for path in paths)
-    parts: list[dict[str, np.ndarray]] = []
-    n_found = n_numbers = 0
-    for path in paths:
-        with wrap_dataset_errors(str(path)), pyarrow.parquet.ParquetFile(path) as file:
-            missing = sorted(set(names) - set(file.schema_arrow.names))
-            if missing:
-                raise DatasetError(f"{path}: has no column {', '.join(missing)}.")
-            n_found += file.metadata.num_rows
-            groups = [file.metadata.row_group(i) for i in range(file.metadata.num_row_groups)]
-            n_numbers += sum(group.column(i).num_values for group in groups for i in range(group.num_columns))
-            check_size(8 * n_numbers, n_stored, f"{source}: {n_found} frames")
-            table = file.read(columns=list(names))
-            table.validate(full=True)
-            parts.append({name: as_numbers(table[name].combine_chunks(), f"{path}: {name}") for name in names})
-    if n_found != n_frames:
-        raise DatasetError(f"{source}: {INFO} tells of {n_frames} frames; there are {n_found}.")
-    with wrap_dataset_errors(source):
-        return {name: np.concatenate([part[name] for part in parts]) for name in names}, n_stored
+    success = labels[SUCCESS] > 0 if SUCCESS in labels else None
+    told = None if success is None else bool(success.any())
+    if REWARD in labels:
+        ended = success if success is not None else labels.get(DONE, np.zeros(n_steps))
+        return labels[REWARD], bool(ended[-1]), told
+    marks = np.eye(1, n_steps, n_steps - 1)[0] if success is None else success
+    return marks[: int(np.argmax(marks)) + 1 if marks.any() else n_steps].astype(float), bool(marks.any()), told
 
 
 def _place(number: int, numbers: np.ndarray, source: str) -> int:

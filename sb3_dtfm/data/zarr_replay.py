@@ -190,7 +190,8 @@ def _chosen(
         vectors = [name for name in OBSERVATIONS if name in data][:1]
         keys = [*images, *vectors] or [name for name in data if name != actions]
     found = {}
-    for name, wanted in keys.items() if isinstance(keys, Mapping) else ((key, key) for key in keys):
+    # The environment shows its entries in the order of their names.
+    for name, wanted in sorted(keys.items()) if isinstance(keys, Mapping) else ((key, key) for key in keys):
         parts = COLUMNS.fullmatch(wanted)
         array = parts[1] if parts else wanted
         if array not in data:

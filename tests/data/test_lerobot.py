@@ -32,7 +32,7 @@ def write(folder, version="v2.1", info=None, **changes):
     found = columns(**changes)
     episodes = found["episode_index"]
     features = {name: {"dtype": str(v.dtype), "shape": list(v.shape[1:]) or [1], "names": None} for name, v in found.items()}
-    features["observation.images.top"] = {"dtype": "video", "shape": [480, 640, 3], "names": ["height", "width", "channel"]}
+    features["language"] = {"dtype": "string", "shape": [1], "names": None}
     told = {"codebase_version": version, "total_frames": len(episodes), "total_episodes": 3, "fps": 30, "features": features}
     (folder / "meta").mkdir(parents=True)
     (folder / "meta" / "info.json").write_text(json.dumps({**told, **(info or {})}))
@@ -84,7 +84,7 @@ UNFIT = {
     "no action": (dict(action=None), "has no feature 'action' of numbers, only episode_index"),
     "no vectors": (
         {"observation.state": None, "observation.environment_state": None},
-        "no feature of numbers begins with 'observation.', only action",
+        "no feature of numbers or images begins with 'observation.', only action",
     ),
     "frames": (dict(frame_index=np.arange(12)), "episode 1: frame_index does not count its 5 frames from 0 on"),
     "other frames than told": (dict(info={"total_frames": 13}), "info.json tells of 13 frames; there are 12"),
