@@ -12,6 +12,8 @@ environment arguments and wrappers are found whether its folder is named or a zi
 examples:
   sb3-dtfm record --algo tqc --model agent.zip --env HalfCheetah-v5 --episodes 100 --dataset-id local/halfcheetah/expert-v0
   sb3-dtfm record --algo ppo --model logs/ppo/Hopper-v5_1 --env Hopper-v5 --episodes 100 --dataset-id local/hopper/ppo-v0
+  sb3-dtfm record --algo sac --model agent.zip --env Pendulum-v1 --episodes 100 --dataset-id local/pendulum/pixels-v0 \\
+      --camera render
   sb3-dtfm record --demonstrator lift --episodes 200 --output datasets/lift.hdf5
 """
 
@@ -35,8 +37,6 @@ AGENT_OPTIONS: dict[str, tuple[bool, dict]] = {
 DEMONSTRATOR_OPTIONS: dict[str, tuple[bool, dict]] = {
     "output": (True, {"metavar": "FILE", "help": "robomimic hdf5 file to write"}),
     "pause": (False, {"type": float, "metavar": "STEPS", "help": "mean time that the hand rests before it closes"}),
-    "camera": (False, {"nargs": "+", "metavar": "NAME", "help": "record images of these cameras, e.g. agentview"}),
-    "camera_size": (False, {"type": int, "metavar": "PIXELS", "help": "their height and width, 84 by default"}),
     "workers": (False, {"type": int, "metavar": "N", "help": "processes side by side"}),
 }
 
@@ -54,6 +54,14 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--episodes", type=int, required=True, metavar="N", help="episodes to keep")
     parser.add_argument("--seed", type=int, default=0, help="0 by default")
     parser.add_argument("--noise", type=float, default=0.0, metavar="STD", help="Gaussian action noise, share of the range")
+    parser.add_argument(
+        "--camera",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="record images: of a demonstration's cameras, e.g. agentview; of an agent 'render', what its environment draws",
+    )
+    parser.add_argument("--camera-size", type=int, default=84, metavar="PIXELS", help="height and width, 84 by default")
     parser.add_argument("--overwrite", action="store_true", help="replace a dataset that is there already")
     agent = parser.add_argument_group("a trained agent")
     demonstrator = parser.add_argument_group("a scripted demonstrator")
@@ -76,6 +84,9 @@ def main(argv: Sequence[str]) -> None:
         parser.error(f"argument --episodes: must be at least 1, got {options.episodes}")
     if options.demonstrator is None:
         _check(parser, options, AGENT_OPTIONS, DEMONSTRATOR_OPTIONS, "without --demonstrator (recording a trained agent)")
+        if options.camera not in ([], ["render"]):
+            wrong = f"only 'render' is accepted of an agent, got {' '.join(options.camera)}"
+            parser.error(f"argument --camera: {wrong}; images that an environment observes are recorded anyway")
         _record_agent(options)
     else:
         _check(parser, options, DEMONSTRATOR_OPTIONS, AGENT_OPTIONS, f"with --demonstrator {options.demonstrator}")
@@ -101,6 +112,7 @@ def _record_agent(options: argparse.Namespace) -> None:
         vec_normalize_path=options.vec_normalize,
         env_kwargs=dict(options.env_kwargs or []),
         env_wrapper=options.env_wrapper,
+        picture_size=options.camera_size if options.camera else None,
         **optional,
     )
     print(f"Recorded {dataset.total_episodes} episodes, {dataset.total_steps} steps: {dataset.id}")
@@ -118,8 +130,8 @@ def _record_demonstrations(options: argparse.Namespace) -> None:
         seed=options.seed,
         n_workers=options.workers,
         overwrite=options.overwrite,
-        cameras=options.camera or (),
-        camera_size=options.camera_size or 84,
+        cameras=options.camera,
+        camera_size=options.camera_size,
     )
     print(summary)
 

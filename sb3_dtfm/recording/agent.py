@@ -11,13 +11,15 @@ import minari
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from gymnasium.wrappers import TransformObservation
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecNormalize
 from tqdm import tqdm
 
 from sb3_dtfm.data.trajectories import check_action_space
-from sb3_dtfm.envs import register_gymnasium_robotics, warn_of_reward
+from sb3_dtfm.envs import RenderWrapper, register_gymnasium_robotics, warn_of_reward
+from sb3_dtfm.envs.cameras import STATE
 from sb3_dtfm.envs.seeding import warn_of_seeds
 from sb3_dtfm.recording.episodes import (
     ActFunction,
@@ -50,6 +52,7 @@ def record_agent(
     env_kwargs: dict[str, Any] | None = None,
     device: str = "cpu",
     env_wrapper: str | None = None,
+    picture_size: int | None = None,
 ) -> minari.MinariDataset:
     """
     Run a trained agent and write its episodes as a Minari dataset.
@@ -84,6 +87,8 @@ def record_agent(
     :param device: where the agent's network runs
     :param env_wrapper: class, with its module, of the wrapper that the agent sees the environment through; that of its run
         by default
+    :param picture_size: record what the environment renders, too, as :class:`~sb3_dtfm.envs.RenderWrapper` shows it in this
+        height and width, pixels; the agent sees nothing of it
     :return: the dataset
     :raises DatasetError: the id is malformed or exists, or the environment's actions are neither a bounded Box nor
         Discrete
@@ -98,9 +103,10 @@ def record_agent(
     register_gymnasium_robotics()
     files = find_agent(model_path, env_id)
     make_kwargs = {**files.env_kwargs, **(env_kwargs or {})}
-    recorders = [EpisodeRecorder(gym.make(env_id, **make_kwargs)) for _ in range(min(n_envs, n_episodes))]
+    recorders = [EpisodeRecorder(_make(env_id, make_kwargs, picture_size)) for _ in range(min(n_envs, n_episodes))]
     wrapper = find_wrapper(env_wrapper) if env_wrapper else files.wrapper
-    envs = [wrapper(recorder) for recorder in recorders] if wrapper else recorders
+    envs: list[gym.Env] = [each if picture_size is None else _without_picture(each) for each in recorders]
+    envs = [wrapper(env) for env in envs] if wrapper else envs
     try:
         check_action_space(recorders[0].action_space, env_id)
         warn_of_reward(recorders[0])
@@ -126,6 +132,19 @@ def record_agent(
     finally:
         for env in envs:
             env.close()
+
+
+def _make(env_id: str, kwargs: dict[str, Any], picture_size: int | None) -> gym.Env:
+    if picture_size is None:
+        return gym.make(env_id, **kwargs)
+    return RenderWrapper(gym.make(env_id, **{"render_mode": "rgb_array", **kwargs}), picture_size)
+
+
+def _without_picture(recorder: EpisodeRecorder) -> gym.Env:
+    """What stands around a recorder, as if the environment inside were not rendered."""
+    space = recorder.env.get_wrapper_attr("env").observation_space
+    in_dict = isinstance(space, spaces.Dict)
+    return TransformObservation(recorder, lambda seen: {key: seen[key] for key in space} if in_dict else seen[STATE], space)
 
 
 def episode_seeds(seed: int, n_episodes: int) -> list[int]:

@@ -23,6 +23,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.algorithms.model import SequenceModel
 from sb3_dtfm.algorithms.saving import head_name
+from sb3_dtfm.envs import channels_first, image_spaces
 from sb3_dtfm.files import holds_pickles, read_configuration, read_run
 from sb3_dtfm.finetuning import FINETUNED, FinetunedDTFM
 from sb3_dtfm.recording.onnx_agent import OnnxAgent
@@ -210,6 +211,8 @@ def load_fitting_agent(
 def _shapes(space: spaces.Space) -> Any:
     if isinstance(space, spaces.Dict):
         return {key: _shapes(part) for key, part in space.spaces.items()}
+    for image in image_spaces(space).values():  # SB3 has moved the channels to the front
+        return channels_first(image).shape
     return (space.start, space.n) if isinstance(space, spaces.Discrete) else space.shape
 
 

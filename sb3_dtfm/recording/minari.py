@@ -1,6 +1,7 @@
 """Writes recorded episodes as a Minari dataset."""
 
 import errno
+import io
 import os
 import shutil
 import warnings
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import h5py
 import minari
 import numpy as np
 from gymnasium import spaces
@@ -18,8 +20,11 @@ from minari.dataset.minari_dataset import parse_dataset_id
 from minari.dataset.minari_storage import MinariStorage, is_image_space
 from minari.namespace import create_namespace, list_local_namespaces
 from minari.storage import get_dataset_path
+from PIL import Image
 
+from sb3_dtfm.data.minari import HDF5_FILE_NAME
 from sb3_dtfm.data.trajectories import DatasetError
+from sb3_dtfm.envs import image_spaces
 from sb3_dtfm.files import find_leftovers, hidden_name
 from sb3_dtfm.recording.episodes import RecordedEpisode, stack_observations
 
@@ -64,13 +69,14 @@ def write_minari(
         (staging / "new").mkdir()
         storage = MinariStorage.new(staging / "new" / "data", env.observation_space, env.action_space, _storable_spec(env))
         storage.update_metadata({"dataset_id": dataset_id, "minari_version": minari.__version__})
-        returns = []
+        returns: list[float] = []
         for episode in episodes:
-            buffer = _episode_buffer(episode, env.observation_space)
-            _check_space(staging, buffer)
-            storage.update_episodes([buffer])
-            returns.append(np.sum(episode.rewards))
-        storage.update_metadata({**metadata, "ref_max_score": float(np.mean(returns))})
+            seen = stack_observations(episode.observations)
+            _check_space(staging, seen, episode)
+            storage.update_episodes([_episode_buffer(episode, seen, env.observation_space)])
+            _write_images(storage.data_path / HDF5_FILE_NAME, len(returns), seen, env.observation_space)
+            returns.append(float(np.sum(episode.rewards)))
+        storage.update_metadata({**metadata, "dataset_size": storage.get_size(), "ref_max_score": float(np.mean(returns))})
         if namespace is not None and namespace not in list_local_namespaces():
             create_namespace(namespace)
         if target.exists():
@@ -98,13 +104,13 @@ def _clear_up(folder: Path, target: Path) -> None:
         shutil.rmtree(leftover, ignore_errors=True)
 
 
-def _check_space(folder: Path, episode: EpisodeBuffer) -> None:
+def _check_space(folder: Path, seen: Any, episode: RecordedEpisode) -> None:
     """
     HDF5 ends in a segmentation fault where the disk is full: leave before.
 
     :raises OSError: an episode may not fit
     """
-    needed = 2 * sum(map(_n_bytes, (episode.observations, episode.actions, episode.rewards))) + SPARE
+    needed = 2 * sum(map(_n_bytes, (seen, episode.actions, episode.rewards))) + SPARE
     if shutil.disk_usage(folder).free < needed:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder.parent))
 
@@ -116,19 +122,47 @@ def _n_bytes(observations: Any) -> int:
 
 
 def _exact(space: spaces.Space, values: Any) -> Any:
-    """Values of steps in a type that Minari stores as they are: uint8 becomes JPEG, which only images are read back from."""
+    """Values of steps that Minari stores as they are: it makes JPEG of uint8. Images are left to :func:`_write_images`."""
     if isinstance(space, spaces.Dict):
-        return {key: _exact(space[key], values[key]) for key in values}
-    return values.astype(np.int16) if values.dtype == np.uint8 and not is_image_space(space) else values
+        return {key: _exact(space[key], values[key]) for key in values if key not in image_spaces(space)}
+    if image_spaces(space):
+        return np.zeros((len(values), 1, 1), np.uint8)
+    return values.astype(np.int16) if values.dtype == np.uint8 else values
 
 
-def _episode_buffer(episode: RecordedEpisode, space: spaces.Space) -> EpisodeBuffer:
+def _write_images(path: Path, number: int, seen: Any, space: spaces.Space) -> None:
+    """
+    Store the images of an episode without loss: Minari reads PNG where it would have written JPEG.
+
+    :param path: the file of the dataset
+    :param number: of the episode
+    :param seen: observations of its steps, (T + 1, ...)
+    :param space: of an observation
+    """
+    with h5py.File(path, "a") as file:
+        group = file[f"episode_{number}"]
+        for camera, image in image_spaces(space).items():
+            alone = not isinstance(space, spaces.Dict)
+            images, name = (seen, "observations") if alone else (seen[camera], f"observations/{camera}")
+            if alone:
+                del group[name]
+            if not is_image_space(image):  # by Minari's rule, which then expects no file of an image
+                group.create_dataset(name, data=images, compression="gzip", chunks=(1, *images.shape[1:]))
+                continue
+            stored = group.create_dataset(name, (len(images),), h5py.vlen_dtype(np.uint8))
+            for step, each in enumerate(images):
+                content = io.BytesIO()
+                Image.fromarray(each[:, :, 0] if each.shape[2] == 1 else each).save(content, "PNG")
+                stored[step] = np.frombuffer(content.getbuffer(), np.uint8)
+
+
+def _episode_buffer(episode: RecordedEpisode, seen: Any, space: spaces.Space) -> EpisodeBuffer:
     ends = np.zeros((2, len(episode.actions)), dtype=bool)
     ends[:, -1] = episode.terminated, episode.truncated
     told = [False, *map(bool, episode.reported)]  # as many as observations; the last one tells of the episode
     return EpisodeBuffer(
         seed=episode.seed,
-        observations=_exact(space, stack_observations(episode.observations)),
+        observations=_exact(space, seen),
         actions=np.stack(episode.actions),
         rewards=np.asarray(episode.rewards, dtype=np.float64),
         terminations=ends[0],
