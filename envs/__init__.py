@@ -22,6 +22,7 @@ if TYPE_CHECKING:
         recorded_space,
         return_to_go_space,
         share_target_return,
+        without_images,
     )
 
 register_go1_env()
@@ -48,6 +49,7 @@ __all__ = [
     "return_to_go_space",
     "share_target_return",
     "warn_of_reward",
+    "without_images",
 ]
 
 

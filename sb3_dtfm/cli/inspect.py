@@ -2,12 +2,13 @@
 
 import argparse
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from gymnasium import spaces
 
 from sb3_dtfm.actions import ActionSpace, same_actions
@@ -15,7 +16,7 @@ from sb3_dtfm.cli.literals import key_value
 from sb3_dtfm.data import DatasetError, TrajectoryBuffer, check_action_space, load_dataset
 from sb3_dtfm.data.decisions import decide, sentences
 from sb3_dtfm.data.inspection import Inspection, Range, inspect_buffer
-from sb3_dtfm.envs import flatten_observation_space, register_gymnasium_robotics
+from sb3_dtfm.envs import flatten_observation_space, image_spaces, register_gymnasium_robotics, without_images
 from sb3_dtfm.envs.packages import import_packages
 
 BLUE, RED, GREY = "#1b6ca8", "#c0562b", "0.6"
@@ -79,7 +80,10 @@ def _load_for(env_id: str, dataset: str | list[str], options: dict[str, Any]) ->
     known = {"action_space": action_space, "observation_space": observed, "max_episode_steps": limit}
     buffer = load_dataset(dataset, **{**known, **options})
     buffer.check_task(env_id)
-    flat = flatten_observation_space(observed)
+    flat, cameras = flatten_observation_space(without_images(observed)), image_spaces(observed)
+    if _images(cameras) != _images(buffer.image_spaces):
+        held = f"images {_images(buffer.image_spaces)}"
+        raise DatasetError(f"{buffer.source} holds {held}; those of {env_id} are {_images(cameras)}.")
     fits = same_actions(check_action_space(action_space, env_id), buffer.action_space)
     if flat.shape != buffer.observation_space.shape or not fits:
         held = f"{buffer.observation_space.shape} and actions of {buffer.action_space}"
@@ -132,6 +136,8 @@ def table(buffer: TrajectoryBuffer, found: Inspection) -> list[str]:
         "observations": _numbers(found.observations),
         "actions": _actions(buffer, found),
     }
+    if buffer.image_spaces:
+        rows["images"] = _images(buffer.image_spaces)
     return [f"| {buffer.source} | |", "| --- | --- |", *(f"| {name} | {what} |" for name, what in rows.items())]
 
 
@@ -161,6 +167,10 @@ def loading(dataset: str | list[str], options: dict[str, Any], env_id: str | Non
         limit = gym.spec(env_id).max_episode_steps
         given = {"action_space": f"gymnasium.make({env_id!r}).action_space", "max_episode_steps": repr(limit), **given}
     return f"sb3_dtfm.data.load_dataset({', '.join([repr(dataset), *map('='.join, given.items())])})"
+
+
+def _images(cameras: Mapping[str, spaces.Box]) -> str:
+    return ", ".join(f"{camera} {' x '.join(map(str, space.shape))}" for camera, space in cameras.items()) or "none"
 
 
 def _actions(buffer: TrajectoryBuffer, found: Inspection) -> str:
@@ -209,7 +219,7 @@ def command(
 
 def draw(buffer: TrajectoryBuffer, found: Inspection, output: Path, title: str) -> Path:
     """
-    Draw returns, lengths, rewards over time, and the actions' ranges.
+    Draw returns, lengths, rewards over time, the actions' ranges, and what each camera saw in the first episode.
 
     :param buffer: the dataset
     :param found: in it
@@ -219,8 +229,11 @@ def draw(buffer: TrajectoryBuffer, found: Inspection, output: Path, title: str) 
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9.0, 6.2), layout="constrained")
-    (returns, lengths), (over_time, actions) = figure.subplots(2, 2)
+    n_cameras = len(buffer.image_spaces)
+    figure = Figure(figsize=(9.0, 6.2 + 2.6 * n_cameras), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=(6.2, 2.6 * n_cameras + 0.01))
+    (returns, lengths), (over_time, actions) = above.subplots(2, 2)
+    _draw_images(below, buffer)
     n_bins = min(50, max(10, buffer.n_episodes // 4))
     returns.hist(buffer.episode_returns, bins=n_bins, color=BLUE)
     returns.axvline(found.target_return, color=RED, linestyle="--")
@@ -241,6 +254,18 @@ def draw(buffer: TrajectoryBuffer, found: Inspection, output: Path, title: str) 
     output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(output, dpi=130)
     return output
+
+
+def _draw_images(figure: Any, buffer: TrajectoryBuffer) -> None:
+    """First, middle and last images of the first episode, a row for each camera."""
+    start, length = int(buffer.episodes.starts[0]), int(buffer.episode_lengths[0])
+    for row, camera in enumerate(buffer.image_spaces):
+        for column, step in enumerate((0, length // 2, length - 1)):
+            axis = figure.add_subplot(len(buffer.image_spaces), 3, 3 * row + column + 1)
+            image = buffer.images(th.tensor([start + step]), (1,))[camera][0].cpu().numpy()
+            axis.imshow(np.moveaxis(image, 0, 2), cmap="gray", vmin=0, vmax=255)
+            axis.set_title(f"{camera}, step {step}", fontsize="medium")
+            axis.axis("off")
 
 
 def _draw_actions(axis: Any, space: ActionSpace, found: Range) -> None:

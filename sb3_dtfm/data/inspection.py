@@ -66,8 +66,14 @@ def inspect_buffer(buffer: TrajectoryBuffer) -> Inspection:
     low, high = (th.from_numpy(bound).to(values) for bound in bounds_of(vector_space(buffer.action_space)))
     margin = AT_BOUND * (high - low)
     at_bounds = float(((values <= low + margin) | (values >= high - margin)).float().mean())
-    remarks = [*_of_episodes(buffer), *_of_observations(observations), *_of_actions(buffer, actions, at_bounds)]
+    seen = [] if images_alone(buffer) else _of_observations(observations)
+    remarks = [*_of_episodes(buffer), *seen, *_of_actions(buffer, actions, at_bounds)]
     return Inspection(observations, actions, at_bounds, suggested_target_return(buffer), remarks)
+
+
+def images_alone(buffer: TrajectoryBuffer) -> bool:
+    """Whether there are no numbers beside images, but for one that is always 0."""
+    return bool(buffer.image_spaces) and not buffer.own("observations").any()
 
 
 def suggested_target_return(buffer: TrajectoryBuffer) -> float:
@@ -140,7 +146,7 @@ def _of_episodes(buffer: TrajectoryBuffer) -> list[str]:
     remarks = []
     if n < FEW_EPISODES:
         remarks.append(f"There are {_count(n, 'episode')}: what is learned depends on which ones.")
-    if n_twice:
+    if n_twice and not images_alone(buffer):
         remarks.append(f"There twice: {_count(n_twice, 'episode')} of {n}.")
     if n_short:
         remarks.append(f"Of a single step: {_count(n_short, 'episode')} of {n}.")

@@ -6,6 +6,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from PIL import Image
 
 import sb3_dtfm
 from sb3_dtfm.cli.main import main
@@ -167,6 +168,26 @@ def test_a_task_of_another_package_is_found(workplace, capsys):
     command = capsys.readouterr().out.split("To begin with:\n")[1].splitlines()[0]
     assert command.endswith("--gym-packages inspected_tasks")
     assert main([*shlex.split(command)[1:], "-n", "2", "--eval-freq", "-1", "--verbose", "0"]) == 0
+
+
+def test_images_are_named_and_drawn(workplace, capsys):
+    rng = np.random.default_rng(0)
+    frames = {"image:front": rng.integers(0, 256, (20, 40, 48, 3), np.uint8)}
+    frames["image:hand"] = rng.integers(0, 256, (20, 1, 40, 40), np.uint8)
+    np.savez("pixels.npz", **{**pendulum_arrays(), **frames})
+    assert main(["inspect", "pixels.npz", "--dataset-kwargs", "action_bounds:(-2, 2)"]) == 0
+    text = capsys.readouterr().out
+    assert "| images | front 40 x 48 x 3, hand 1 x 40 x 40 |" in text
+    with_images = Image.open("dataset.png").size
+    wanted = "['image:front']"
+    assert main(["inspect", "pixels.npz", "--dataset-kwargs", "action_bounds:(-2, 2)", f"observation_keys:{wanted}"]) == 0
+    text = capsys.readouterr().out
+    assert "| images | front 40 x 48 x 3 |" in text
+    assert "never change" not in text
+    assert "There twice" not in text
+    assert Image.open("dataset.png").size[1] < with_images[1]
+    assert main(["inspect", "pixels.npz", "--env", "Pendulum-v1"]) == 2
+    assert "holds images front 40 x 48 x 3, hand 1 x 40 x 40; those of Pendulum-v1 are none" in capsys.readouterr().err
 
 
 def test_data_of_another_environment_are_refused(workplace, capsys):
