@@ -152,8 +152,7 @@ class FinetuningManager(OfflineExperimentManager):
         from_the_run = ["env_wrapper", *([] if self.env_kwargs else ["env_kwargs"])]  # of the command line, if given there
         from_the_run += self.of_the_data
         hyperparams = {**{key: known[key] for key in from_the_run if known.get(key)}, **hyperparams}
-        if self._eval_env_kwargs_args is None:
-            self.eval_env_kwargs = hyperparams.get("env_kwargs") or self.env_kwargs
+        self.evaluate_alike(hyperparams)
         if self.target_return is not None:
             hyperparams["env_wrapper"] = with_target_return(self.target_return, hyperparams.get("env_wrapper"))
         if not hyperparams.get("env_wrapper"):

@@ -134,11 +134,17 @@ class OfflineExperimentManager(ExperimentManager):
         self._check_settings(hyperparams)
         if self.algo not in ALGORITHMS:
             return hyperparams, saved
+        self.evaluate_alike(hyperparams)
         hyperparams = with_policy_options(hyperparams)
         if self.learns_offline:
             wrappers = hyperparams.get("env_wrapper")
             hyperparams = {**hyperparams, "env_wrapper": with_target_return(find_target_return(wrappers), wrappers)}
         return hyperparams, OrderedDict(sorted(hyperparams.items()))
+
+    def evaluate_alike(self, hyperparams: dict[str, Any]) -> None:
+        """Give evaluations the arguments of the environment that the settings have, which RL-Zoo may leave out."""
+        if self._eval_env_kwargs_args is None:
+            self.eval_env_kwargs = hyperparams.get("env_kwargs") or self.env_kwargs
 
     @property
     def learns_offline(self) -> bool:
