@@ -31,7 +31,7 @@ from sb3_dtfm.algorithms.saving import (
 from sb3_dtfm.arguments import NOT_NEGATIVE, POSITIVE, Number, Rule, check_arguments
 from sb3_dtfm.data import DatasetError, ReturnReference, ScoreReference, TrajectoryBuffer, check_action_space
 from sb3_dtfm.distributed import check_batch_size, is_first_process
-from sb3_dtfm.envs import ReturnToGoWrapper, check_vec_env, image_spaces, known_task, share_target_return
+from sb3_dtfm.envs import ReturnToGoWrapper, channels_first, check_vec_env, image_spaces, known_task, share_target_return
 from sb3_dtfm.files import ModelFile, ModelFileError, file_name, holds_pickles, read_model, write_model, write_onnx
 from sb3_dtfm.optimization import RunningMeans
 from sb3_dtfm.policies import SequencePolicy
@@ -225,7 +225,7 @@ class SequenceModel(BaseAlgorithm):
         if ours.shape != theirs.shape:
             raise DatasetError(f"{found} observations of {theirs}, {expected} {ours}.")
         own, others = (
-            {camera: image.shape for camera, image in image_spaces(space).items()}
+            {camera: channels_first(image).shape for camera, image in image_spaces(space).items()}
             for space in (self.observation_space, observation_space)
         )
         if own != others:

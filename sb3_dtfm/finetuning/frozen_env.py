@@ -134,12 +134,17 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
         :param between: for each row what was observed between its actions
         :param n_steps: how often the others observed
         """
-        newest = {OBSERVATION: context.observations[:, -1].copy(), RETURN_TO_GO: context.returns_to_go[:, -1:].copy()}
+        vectors = context.observations[:, -1, : self.policy.vector_dim].copy()
+        newest = {OBSERVATION: vectors, RETURN_TO_GO: context.returns_to_go[:, -1:].copy()}
+        for camera, space in self.policy.image_spaces.items():
+            newest[camera] = np.zeros((len(between), *space.shape), np.uint8)
         timestep = context.timesteps[:, -1:]
         for step in range(n_steps):
             for row, seen in enumerate(between):
                 for key in newest if step < len(seen[TIMESTEP]) else ():
-                    newest[key][row] = seen[key][step]
+                    shown = seen[key][step]
+                    channels_last = shown.shape != newest[key].shape[1:]
+                    newest[key][row] = np.moveaxis(shown, 2, 0) if channels_last else shown
             observation = {**newest, TIMESTEP: timestep + step + 1}
             _, state = self.policy.predict(observation, tuple(context), np.zeros(len(between), bool))
             assert state is not None

@@ -51,11 +51,13 @@ class Step(NamedTuple):
     :param observations: (B, O), as the environments gave them
     :param actions: (B, A) in their range, or (B,) of choices
     :param rewards: (B,)
+    :param images: (B, channels, height, width) by camera, or channels last
     """
 
     observations: np.ndarray
     actions: np.ndarray
     rewards: np.ndarray
+    images: dict[str, np.ndarray]
 
 
 class OnlineDTFM(DTFM):
@@ -190,7 +192,8 @@ class OnlineDTFM(DTFM):
             actions, self._state = self.policy.predict(observations, self._state, self._last_episode_starts)
             self._last_obs, rewards, dones, infos = self.env.step(actions)  # type: ignore[assignment]
             self._last_episode_starts = dones
-            self._running.append(Step(observations[OBSERVATION], actions, rewards))
+            images = {camera: observations[camera] for camera in self.policy.image_spaces}
+            self._running.append(Step(observations[OBSERVATION], actions, rewards, images))
             self._update_info_buffer(infos, dones)
             if dones.any():  # at once, so that a checkpoint has all
                 self._keep([self._take(row, infos[row]) for row in np.flatnonzero(dones)])
@@ -208,7 +211,9 @@ class OnlineDTFM(DTFM):
         steps = self._running[self._began[row] :]
         self._began[row] = len(self._running)
         truncated = bool(info.get("TimeLimit.truncated", False))
-        own = Step(*(np.stack([array[row] for array in column]) for column in zip(*steps, strict=True)))
+        numbers = (np.stack([array[row] for array in column]) for column in zip(*(step[:-1] for step in steps), strict=True))
+        images = {camera: np.stack([step.images[camera][row] for step in steps]) for camera in self.policy.image_spaces}
+        own = Step(*numbers, images)
         success = reported_success(info)
         return Trajectory(**own._asdict(), terminated=not truncated, truncated=truncated, success=success)
 
@@ -243,7 +248,8 @@ class OnlineDTFM(DTFM):
         """
         path = with_npz(path)
         own = load_dataset(path, action_space=self.action_space)
-        self._check_spaces(return_to_go_space(own.observation_space), own.action_space, f"{path} holds", "the model's are")
+        observed = return_to_go_space(own.observation_space, own.image_spaces)
+        self._check_spaces(observed, own.action_space, f"{path} holds", "the model's are")
         self.replay_buffer = own.to(self.device)
 
     def _imitate(self, parallel: DataParallel, n_steps: int) -> None:
