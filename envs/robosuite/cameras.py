@@ -1,5 +1,6 @@
 """robosuite's cameras as observations: upright, in the same light wherever they are drawn."""
 
+import weakref
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,6 +13,8 @@ class Cameras:
     Images of the present state by robomimic's names, `agentview_image` for the camera `agentview`. They are upright, as in
     robomimic's files (robosuite's own are upside down), and without shadows and reflections, which take most of the time
     where no GPU draws.
+
+    :ivar close: frees what draws
 
     :param model: MuJoCo's
     :param names: of cameras
@@ -37,6 +40,8 @@ class Cameras:
             raise RuntimeError(
                 f"cameras: MuJoCo cannot draw here ({error}): before Python starts, set MUJOCO_GL to egl or osmesa."
             ) from error
+        # Also when Python ends, before what it draws with is gone.
+        self.close = weakref.finalize(self, self._renderer.close)
         self._option = mujoco.MjvOption()
         self._option.geomgroup[0] = 0  # collision shapes
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
@@ -56,10 +61,6 @@ class Cameras:
             self._renderer.update_scene(data, camera=name, scene_option=self._option)
             images[image_key(name)] = self._renderer.render()
         return images
-
-    def close(self) -> None:
-        """Free the renderer."""
-        self._renderer.close()
 
 
 def camera_args(names: Sequence[str], size: int) -> dict[str, Any]:

@@ -231,7 +231,8 @@ def draw(buffer: TrajectoryBuffer, found: Inspection, output: Path, title: str) 
 
     n_cameras = len(buffer.image_spaces)
     figure = Figure(figsize=(9.0, 6.2 + 2.6 * n_cameras), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(6.2, 2.6 * n_cameras + 0.01))
+    parts: Any = figure.subfigures(2, 1, height_ratios=(6.2, 2.6 * n_cameras + 0.01))
+    above, below = parts
     (returns, lengths), (over_time, actions) = above.subplots(2, 2)
     _draw_images(below, buffer)
     n_bins = min(50, max(10, buffer.n_episodes // 4))

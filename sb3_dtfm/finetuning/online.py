@@ -211,11 +211,15 @@ class OnlineDTFM(DTFM):
         steps = self._running[self._began[row] :]
         self._began[row] = len(self._running)
         truncated = bool(info.get("TimeLimit.truncated", False))
-        numbers = (np.stack([array[row] for array in column]) for column in zip(*(step[:-1] for step in steps), strict=True))
-        images = {camera: np.stack([step.images[camera][row] for step in steps]) for camera in self.policy.image_spaces}
-        own = Step(*numbers, images)
-        success = reported_success(info)
-        return Trajectory(**own._asdict(), terminated=not truncated, truncated=truncated, success=success)
+        return Trajectory(
+            observations=np.stack([step.observations[row] for step in steps]),
+            actions=np.stack([step.actions[row] for step in steps]),
+            rewards=np.stack([step.rewards[row] for step in steps]),
+            terminated=not truncated,
+            truncated=truncated,
+            success=reported_success(info),
+            images={camera: np.stack([step.images[camera][row] for step in steps]) for camera in self.policy.image_spaces},
+        )
 
     def _keep(self, episodes: list[Trajectory]) -> None:
         """Put own episodes behind the earlier ones."""
