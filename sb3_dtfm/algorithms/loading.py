@@ -14,10 +14,12 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_dtfm.algorithms.saving import (
     ENCODED,
+    EXTRACTOR_KWARGS,
     NEVER_SAVED,
     OPTIMIZER,
     POLICY,
     SPACES,
+    WEIGHTS,
     UnsavedSchedule,
     head_name,
     optimizers,
@@ -164,6 +166,9 @@ def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
     """What is not checked as arguments are."""
     if not isinstance(attributes.get("policy_kwargs", {}), dict):
         raise ModelFileError(f"{source}: policy_kwargs are {attributes['policy_kwargs']!r}, expected arguments by name.")
+    extractor = attributes.get("policy_kwargs", {}).get(EXTRACTOR_KWARGS)
+    if isinstance(extractor, dict) and WEIGHTS in extractor:
+        raise ModelFileError(f"{source}: {EXTRACTOR_KWARGS} name a file of {WEIGHTS}, which no saved model needs.")
     dataset_kwargs = attributes.get("dataset_kwargs") or {}
     if not isinstance(dataset_kwargs, dict) or set(NEVER_SAVED) & set(dataset_kwargs):
         expected = f"arguments by name, without {' and '.join(NEVER_SAVED)}"

@@ -25,6 +25,8 @@ ENCODED = {*SPACES, "policy_class", "learning_rate", "_means"}
 
 # Of `dataset_kwargs`: whoever loads a model says where a cache may lie and whether a pickle may run.
 NEVER_SAVED = ("cache_dir", "allow_pickle")
+# Of `features_extractor_kwargs`: a file that only the first training needs.
+EXTRACTOR_KWARGS, WEIGHTS = "features_extractor_kwargs", "weights"
 
 
 class UnsavedSchedule:
@@ -63,6 +65,10 @@ def to_configuration(model: BaseAlgorithm, left_out: Iterable[str], wanted: Iter
     if attributes.get("dataset_kwargs"):
         kept = {name: value for name, value in attributes["dataset_kwargs"].items() if name not in NEVER_SAVED}
         attributes["dataset_kwargs"] = kept
+    policy_kwargs = attributes.get("policy_kwargs") or {}
+    if extractor := policy_kwargs.get(EXTRACTOR_KWARGS):
+        kept = {name: value for name, value in extractor.items() if name != WEIGHTS}
+        attributes["policy_kwargs"] = {**policy_kwargs, EXTRACTOR_KWARGS: kept}
     saved: dict[str, Any] = {}
     for name, value in attributes.items():
         try:

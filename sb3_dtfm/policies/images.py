@@ -12,6 +12,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureC
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_dtfm.policies.resnet import ResNet18
+
 # Channels in each group of a group normalisation.
 GROUP = 8
 # Random crops in a batch on a CPU: slices, since indices for each image take as long as a convolution.
@@ -109,7 +111,9 @@ def spatial_softmax(maps: th.Tensor) -> th.Tensor:
 
 
 # By the name that `features_extractor_class` and saved models have; a user's own class is entered here before loading.
-EXTRACTORS: dict[str, type[BaseFeaturesExtractor]] = {each.__name__: each for each in (ResidualExtractor, NatureCNN)}
+EXTRACTORS: dict[str, type[BaseFeaturesExtractor]] = {
+    each.__name__: each for each in (ResidualExtractor, NatureCNN, ResNet18)
+}
 
 
 class ImageEncoder(nn.Module):

@@ -68,8 +68,8 @@ class PolicyOptions(Options):
     :param observation_scaling: "std" divides observations by their standard deviation, "robust" by the lower quartile of
         the episodes' standard deviations, for data in which some agents' observations vary far more; see
         :meth:`EpisodeTable.statistics`
-    :param features_extractor_class: of images, for each camera: ResidualExtractor, NatureCNN or another class of SB3's kind,
-        which stands in :data:`~sb3_dtfm.policies.images.EXTRACTORS` by its name
+    :param features_extractor_class: of images, for each camera: ResidualExtractor, NatureCNN, ResNet18 or another class of
+        SB3's kind, which stands in :data:`~sb3_dtfm.policies.images.EXTRACTORS` by its name
     :param features_extractor_kwargs: of that class, for example `features_dim`
     :param normalize_images: divide images by 255, as SB3 does
     :param share_features_extractor: one extractor for all cameras instead of one each

@@ -133,6 +133,26 @@ def test_sb3s_own_network_and_one_for_all_cameras(episodes):
     assert shared.policy.observation_dim == model.policy.observation_dim == 3 + 2 * 16
 
 
+def test_torchvisions_resnet_takes_weights_of_a_file(buffer, tmp_path):
+    models = pytest.importorskip("torchvision.models")
+    published = models.resnet18()
+    th.save(published.state_dict(), tmp_path / "resnet18.pth")
+    kwargs = dict(features_dim=8, weights=str(tmp_path / "resnet18.pth"))
+    model = make_model(DT, buffer, policy_kwargs=dict(features_extractor_class="ResNet18", features_extractor_kwargs=kwargs))
+    first = model.policy.network.encoder.extractors[0].network.conv1.weight
+    assert th.equal(first, published.conv1.weight)
+    model.learn(1).save(tmp_path / "model")
+    (tmp_path / "resnet18.pth").unlink()
+    loaded = DT.load(tmp_path / "model")
+    assert loaded.policy_kwargs["features_extractor_kwargs"] == dict(features_dim=8)
+    assert th.equal(loaded.policy.network.encoder.extractors[0].network.conv1.weight, first)
+    observation, _ = wrapped().reset(seed=0)
+    np.testing.assert_array_equal(*(each.predict(observation, deterministic=True)[0] for each in (model, loaded)))
+    th.save(dict(other=th.zeros(1)), tmp_path / "resnet18.pth")
+    with pytest.raises(ValueError, match=r"resnet18\.pth holds no weights of ResNet-18: conv1\.weight is missing"):
+        make_model(DT, buffer, policy_kwargs=dict(features_extractor_class="ResNet18", features_extractor_kwargs=kwargs))
+
+
 def test_a_critic_values_what_images_show(buffer):
     model = make(DTFM, buffer, policy_kwargs=dict(critic_steps=1, n_action_samples=2)).learn(2)
     observation, _ = wrapped().reset(seed=0)

@@ -1,0 +1,51 @@
+"""torchvision's ResNet-18 as an extractor of features; torchvision is imported with the first one."""
+
+from os import PathLike
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+# Mean and standard deviation of ImageNet's channels, by which the weights that torchvision publishes expect them.
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+# Channels in each group of a group normalisation.
+GROUP = 16
+
+
+class ResNet18(BaseFeaturesExtractor):
+    """
+    ResNet-18 (He et al., 2016) with group instead of batch normalisation, whose running means a moving average of weights
+    does not know, as in Diffusion Policy (Chi et al., 2023).
+
+    :param observation_space: Box (3, height, width)
+    :param features_dim: numbers that an image becomes
+    :param weights: file of torchvision's weights, as `torch.save(resnet18(...).state_dict(), weights)` writes it; not saved
+        with a model, which holds the weights that it has learned. Random weights if not given
+    :raises ImportError: torchvision is not installed
+    :raises ValueError: other than three channels, or a file of other weights
+    """
+
+    def __init__(
+        self, observation_space: spaces.Box, features_dim: int = 64, weights: str | PathLike[str] | None = None
+    ) -> None:
+        super().__init__(observation_space, features_dim)
+        try:
+            from torchvision.models import resnet18
+        except ImportError as error:
+            raise ImportError("ResNet18 needs torchvision: pip install torchvision") from error
+        if observation_space.shape[0] != 3:
+            raise ValueError(f"ResNet18 needs images of 3 channels, got {observation_space.shape[0]}.")
+        self.network = resnet18(norm_layer=lambda n_channels: nn.GroupNorm(n_channels // GROUP, n_channels))
+        if weights is not None:
+            found = self.network.load_state_dict(th.load(weights, weights_only=True), strict=False)
+            if found.missing_keys:
+                raise ValueError(f"{weights} holds no weights of ResNet-18: {found.missing_keys[0]} is missing.")
+        self.network.fc = nn.Linear(self.network.fc.in_features, features_dim)
+        self.register_buffer("mean", th.tensor(MEAN).view(3, 1, 1), persistent=False)
+        self.register_buffer("std", th.tensor(STD).view(3, 1, 1), persistent=False)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """From (N, 3, height, width) to (N, features_dim)."""
+        features: th.Tensor = self.network((observations - self.mean) / self.std)
+        return features
