@@ -26,6 +26,9 @@ class ResNet18(BaseFeaturesExtractor):
     :raises ValueError: other than three channels, or a file of other weights
     """
 
+    mean: th.Tensor
+    std: th.Tensor
+
     def __init__(
         self, observation_space: spaces.Box, features_dim: int = 64, weights: str | PathLike[str] | None = None
     ) -> None:
