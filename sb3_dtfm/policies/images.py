@@ -32,7 +32,9 @@ class ResidualExtractor(BaseFeaturesExtractor):
     :param features_dim: numbers that an image becomes
     :param channels: of the first convolution and of each residual block; all but the last block halve height and width
     :param crop: kept share of height and width, in (0, 1]
-    :raises ValueError: another `crop`, or fewer than two channels
+    :param shift: pixels by which the edges are repeated before a random crop; 4 with `crop=1.0` is the random shift of DrQ
+        (Kostrikov et al., 2021)
+    :raises ValueError: another `crop`, a negative `shift`, or fewer than two channels
     """
 
     def __init__(
@@ -41,10 +43,14 @@ class ResidualExtractor(BaseFeaturesExtractor):
         features_dim: int = 64,
         channels: tuple[int, ...] = (32, 64, 64),
         crop: float = 0.9,
+        shift: int = 0,
     ) -> None:
         super().__init__(observation_space, features_dim)
         if not 0.0 < crop <= 1.0 or len(channels) < 2:
             raise ValueError(f"crop must be a number in (0, 1] and channels two or more, got {crop!r} and {channels!r}.")
+        if shift < 0:
+            raise ValueError(f"shift must be a number of pixels, 0 or more, got {shift!r}.")
+        self.shift = shift
         n_channels, height, width = observation_space.shape
         self.size = (round(crop * height), round(crop * width))
         self.stem = nn.Conv2d(n_channels, channels[0], kernel_size=8, stride=4, padding=2)
@@ -60,6 +66,8 @@ class ResidualExtractor(BaseFeaturesExtractor):
 
     def _crop(self, images: th.Tensor) -> th.Tensor:
         """A random part of each image while training, on a CPU of a sixteenth of them; the centre of all otherwise."""
+        if self.training and self.shift:
+            images = F.pad(images, (self.shift,) * 4, mode="replicate")
         (height, width), room = self.size, (images.shape[2] - self.size[0], images.shape[3] - self.size[1])
         if not self.training:
             first, second = room[0] // 2, room[1] // 2

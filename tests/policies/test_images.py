@@ -199,6 +199,21 @@ def test_training_crops_at_random_and_acting_in_the_centre():
         assert th.equal(crops - crops[:, :, :1, :1], (centre - centre[:, :, :1, :1])[:n_images])
 
 
+def test_training_shifts_at_random_and_acting_does_not():
+    extractor = ResidualExtractor(spaces.Box(0, 255, (3, 30, 40), np.uint8), crop=1.0, shift=4)
+    images = th.arange(1.0, 31.0).view(1, 1, 30, 1).expand(32, 3, 30, 40)  # each row its number
+    assert th.equal(extractor.eval()._crop(images), images)
+    shifted = extractor.train()._crop(images)
+    assert shifted.shape == images.shape
+    middle = shifted[:, 0, 15, 20] - 16.0
+    assert set(middle.tolist()) <= set(range(-4, 5))
+    assert len(set(middle.tolist())) > 3
+    assert shifted.min() == 1.0, "edges are repeated, not black"
+    assert shifted.max() == 30.0
+    with pytest.raises(ValueError, match="shift must be a number of pixels, 0 or more, got -1"):
+        ResidualExtractor(spaces.Box(0, 255, (3, 30, 40), np.uint8), shift=-1)
+
+
 def test_spatial_softmax_finds_the_place():
     maps = th.zeros(1, 2, 5, 9)
     maps[0, 0, 0, 8] = maps[0, 1, 2, 4] = 100.0
