@@ -211,6 +211,10 @@ def command(
     words = ["sb3-dtfm", "train", "--algo", algo, "--env", buffer.env_id or "TASK"]
     words += ["--dataset", *datasets, "--target-return", f"{found.target_return:g}"]
     words += ["--gym-packages", *gym_packages] if gym_packages else []
+    if buffer.image_spaces and (buffer.env_id or "").startswith("robosuite/"):  # whose cameras are off by default
+        shown = [camera.removesuffix("_image") for camera in buffer.image_spaces]
+        size = next(iter(buffer.image_spaces.values())).shape[1]
+        words += ["--env-kwargs", f"cameras:{shown}", f"camera_size:{size}"]
     if dataset_kwargs:
         inside = ", ".join(f"{key}={value!r}" for key, value in dataset_kwargs)
         words += ["-params", f"dataset_kwargs:dict({inside})"]
