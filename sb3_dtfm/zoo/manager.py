@@ -21,6 +21,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_dtfm.algorithms import ALGORITHMS
+from sb3_dtfm.algorithms.model import POLICY_NAMES
 from sb3_dtfm.arguments import COUNT, Number, with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.distributed import is_first_process
@@ -135,7 +136,9 @@ class OfflineExperimentManager(ExperimentManager):
         if self.algo not in ALGORITHMS:
             return hyperparams, saved
         self.evaluate_alike(hyperparams)
-        hyperparams = with_policy_options(hyperparams)
+        if self.n_timesteps < 1 and "n_timesteps" not in hyperparams:
+            raise UsageError("n_timesteps: the settings have none; add it there, or give -n.")
+        hyperparams = {"policy": POLICY_NAMES[0], "n_timesteps": self.n_timesteps, **with_policy_options(hyperparams)}
         if self.learns_offline:
             wrappers = hyperparams.get("env_wrapper")
             hyperparams = {**hyperparams, "env_wrapper": with_target_return(find_target_return(wrappers), wrappers)}

@@ -97,3 +97,11 @@ def test_a_run_learns_with_the_first_trial_of_a_study(workplace, capsys):
     command = ["train", "--algo", "dtfm", "--env", "HalfCheetah-v5", "--dataset", DATASET_ID, "-n", "1", "--eval-freq", "-1"]
     assert main([*command, *study, "--trial-id", "0"]) == 0
     assert "Loading from Optuna study" in capsys.readouterr().out
+
+
+def test_settings_may_be_a_dataset_and_steps_alone(workplace, capsys):
+    arguments = ["train", "--algo", "dtfm", "--env", "HalfCheetah-v5", "--eval-freq", "-1", "--conf-file", "mine.yml"]
+    Path("mine.yml").write_text(f"HalfCheetah-v5:\n  dataset: {DATASET_ID}\n")
+    assert main(arguments) == 2
+    assert is_one_line(capsys, "n_timesteps: the settings have none; add it there, or give -n")
+    assert main([*arguments, "-n", "1"]) == 0
