@@ -4,6 +4,7 @@ import argparse
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import gymnasium as gym
@@ -39,7 +40,7 @@ def main(argv: Sequence[str]) -> None:
     options = _parser().parse_args(argv)
     import_packages(options.gym_packages)
     dataset = options.dataset[0] if len(options.dataset) == 1 else options.dataset
-    buffer = load(dataset, dict(options.dataset_kwargs), options.env)
+    buffer = load(dataset, dict(options.dataset_kwargs), options.env, dict(options.env_kwargs))
     found = inspect_buffer(buffer)
     print("\n".join([*table(buffer, found), *dimensions(found.observations)]))
     for remark in found.remarks:
@@ -52,18 +53,24 @@ def main(argv: Sequence[str]) -> None:
     print(f"\nPicture: {draw(buffer, found, Path(options.output), ' + '.join(options.dataset))}")
 
 
-def load(dataset: str | list[str], options: dict[str, Any], env_id: str | None = None) -> TrajectoryBuffer:
+def load(
+    dataset: str | list[str],
+    options: dict[str, Any],
+    env_id: str | None = None,
+    env_kwargs: Mapping[str, Any] = MappingProxyType({}),
+) -> TrajectoryBuffer:
     """
     A dataset as its task would learn from it: up to the time limit, where the task is known here, and the best of that.
 
     :param dataset: Minari id, file, or several of them
     :param options: of its reader
     :param env_id: Gymnasium id of the task; None leaves it to the dataset
+    :param env_kwargs: arguments of `gymnasium.make` for this task
     :raises DatasetError: the dataset cannot be read, or is not of this task
     """
     register_gymnasium_robotics()
     if env_id is not None:
-        return _load_for(env_id, dataset, options)
+        return _load_for(env_id, env_kwargs, dataset, options)
     buffer = load_dataset(dataset, **{name: value for name, value in options.items() if name not in CHOOSING})
     spec = gym.registry.get(buffer.env_id or "")
     limit = None if spec is None else spec.max_episode_steps
@@ -72,8 +79,10 @@ def load(dataset: str | list[str], options: dict[str, Any], env_id: str | None =
     return load_dataset(dataset, **options) if CHOOSING & options.keys() else buffer
 
 
-def _load_for(env_id: str, dataset: str | list[str], options: dict[str, Any]) -> TrajectoryBuffer:
-    env = gym.make(env_id)
+def _load_for(
+    env_id: str, env_kwargs: Mapping[str, Any], dataset: str | list[str], options: dict[str, Any]
+) -> TrajectoryBuffer:
+    env = gym.make(env_id, **env_kwargs)
     observed, action_space = env.observation_space, env.action_space
     limit = None if env.spec is None else env.spec.max_episode_steps
     env.close()
@@ -97,7 +106,7 @@ def _load_for(env_id: str, dataset: str | list[str], options: dict[str, Any]) ->
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="sb3-dtfm inspect",
-        description="Show what is in a dataset, what may be wrong with it, and suggest a target return.",
+        description="Summarise a dataset, list possible faults and suggest a target return.",
     )
     argument = parser.add_argument
     argument("dataset", nargs="+", metavar="DATASET", help="Minari id, file or folder; or several")
@@ -107,9 +116,10 @@ def _parser() -> argparse.ArgumentParser:
         type=key_value,
         default=[],
         metavar="KEY:VALUE",
-        help="options of its reader, as for train",
+        help="arguments of load_dataset, e.g. best_share:0.1",
     )
-    argument("--env", metavar="ID", help="environment to learn it for; by default what the dataset names")
+    argument("--env", metavar="ID", help="Gymnasium id to check the dataset against; the dataset's by default")
+    argument("--env-kwargs", nargs="+", type=key_value, default=[], metavar="KEY:VALUE", help="of gymnasium.make for --env")
     argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="to import first: they register tasks")
     argument("-o", "--output", default="dataset.png", metavar="FILE", help="PNG to write; dataset.png by default")
     return parser

@@ -24,20 +24,20 @@ AGENT_OPTIONS: dict[str, tuple[bool, dict]] = {
     "model": (True, {"metavar": "PATH", "help": "the agent's zip or ONNX file, or the folder of its RL-Zoo run"}),
     "env": (True, {"metavar": "ENV", "help": "Gymnasium environment id"}),
     "dataset_id": (True, {"metavar": "ID", "help": "Minari id to write, e.g. local/halfcheetah/expert-v0"}),
-    "vec_normalize": (False, {"metavar": "FILE", "help": "the agent's VecNormalize statistics; 'none' insists on none"}),
-    "env_kwargs": (False, {"nargs": "+", "type": key_value, "metavar": "KEY:VALUE", "help": "of the environment"}),
+    "vec_normalize": (False, {"metavar": "FILE", "help": "the agent's VecNormalize statistics; 'none' uses no statistics"}),
+    "env_kwargs": (False, {"nargs": "+", "type": key_value, "metavar": "KEY:VALUE", "help": "of gymnasium.make"}),
     "env_wrapper": (
         False,
-        {"metavar": "CLASS", "help": "what the agent sees the environment through; its run's by default"},
+        {"metavar": "CLASS", "help": "wrapper class around the agent's environment; that of its RL-Zoo run by default"},
     ),
-    "stochastic": (False, {"action": "store_true", "help": "draw actions instead of taking the best"}),
-    "n_envs": (False, {"type": int, "metavar": "N", "help": "environments side by side"}),
+    "stochastic": (False, {"action": "store_true", "help": "sample actions; deterministic by default"}),
+    "n_envs": (False, {"type": int, "metavar": "N", "help": "parallel environments"}),
     "gym_packages": (False, {"nargs": "+", "metavar": "MODULE", "help": "to import first: tasks, and a run's wrappers"}),
 }
 DEMONSTRATOR_OPTIONS: dict[str, tuple[bool, dict]] = {
     "output": (True, {"metavar": "FILE", "help": "robomimic hdf5 file to write"}),
-    "pause": (False, {"type": float, "metavar": "STEPS", "help": "mean time that the hand rests before it closes"}),
-    "workers": (False, {"type": int, "metavar": "N", "help": "processes side by side"}),
+    "pause": (False, {"type": float, "metavar": "STEPS", "help": "mean pause before the gripper closes, steps"}),
+    "workers": (False, {"type": int, "metavar": "N", "help": "parallel processes"}),
 }
 
 

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.skipif(BACKEND is None, reason="needs EGL or OSMesa")
 SEEN = """
 import shlex
 import gymnasium, h5py, numpy as np, sb3_dtfm.envs
-from sb3_dtfm.cli.inspect import command
+from sb3_dtfm.cli.inspect import command, load
 from sb3_dtfm.data import load_dataset
 from sb3_dtfm.data.inspection import inspect_buffer
 from sb3_dtfm.envs import ReturnToGoWrapper
@@ -24,6 +24,8 @@ keys = ["agentview_image", "robot0_eye_in_hand_image", "robot0_eef_pos", "robot0
 print(list(env.observation_space))
 buffer = load_dataset("lift.hdf5", observation_keys=keys)
 print(*shlex.split(command(["lift.hdf5"], [], [], buffer, inspect_buffer(buffer)))[-3:])
+shown = {"cameras": cameras, "camera_size": 48}
+print(*load("lift.hdf5", {"observation_keys": keys}, "robosuite/Lift-v0", shown).image_spaces)
 wrapped = ReturnToGoWrapper(env, 1.0)
 with h5py.File("lift.hdf5") as file:
     demo = file["data/demo_0"]
@@ -50,5 +52,6 @@ def test_recorded_images_are_the_observed_ones(tmp_path, monkeypatch):
     keys = ["agentview_image", "robot0_eef_pos", "robot0_eef_quat", "robot0_eye_in_hand_image", "robot0_gripper_qpos"]
     below = "1 the cube lies below the arm"
     unknown = "cameras: there is no nowhere; accepted are frontview, birdvi"
+    seen = ["agentview_image", "robot0_eye_in_hand_image"]
     told = "--env-kwargs cameras:['agentview', 'robot0_eye_in_hand'] camera_size:48"
-    assert result.stdout.splitlines() == [str(keys), told, below, unknown], result.stderr
+    assert result.stdout.splitlines() == [str(keys), told, " ".join(seen), below, unknown], result.stderr
