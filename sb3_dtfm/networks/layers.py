@@ -69,6 +69,13 @@ def normal_(weight: th.Tensor, std: float) -> None:
         nn.init.normal_(weight, std=std)
 
 
+def embedding(n_entries: int, dim: int) -> nn.Embedding:
+    """torch's with its own start, which on the device "meta" would import its compiler for a second."""
+    weight = th.empty(n_entries, dim)
+    normal_(weight, std=1.0)
+    return nn.Embedding.from_pretrained(weight, freeze=False)
+
+
 def keep_mask(like: th.Tensor, probability: float) -> th.Tensor:
     """
     Factors of dropout (Srivastava et al., 2014): 0 with `probability`, otherwise what keeps the mean.

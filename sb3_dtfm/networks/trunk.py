@@ -6,7 +6,7 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_dtfm.networks.layers import Linear, ReturnFilm, dropout, dropout_add, normal_
+from sb3_dtfm.networks.layers import Linear, ReturnFilm, dropout, dropout_add, embedding, normal_
 
 ALL = slice(None)
 
@@ -135,7 +135,7 @@ class SequenceTrunk(nn.Module):
         self.embed_return_to_go = Linear(1, embed_dim)
         self.embed_observation = Linear(observation_dim, embed_dim)
         self.embed_action = Linear(action_dim, embed_dim)
-        self.embed_timestep = nn.Embedding(max_timestep, embed_dim) if timestep_embedding else None
+        self.embed_timestep = embedding(max_timestep, embed_dim) if timestep_embedding else None
         self.dropout = dropout
         self.blocks = nn.ModuleList(TransformerBlock(embed_dim, n_heads, dropout) for _ in range(n_layers))
         self.final_norm = nn.LayerNorm(embed_dim)
