@@ -99,6 +99,7 @@ def judge(agent: Any, env_kwargs: dict[str, Any], wrappers: Sequence[Any], n_epi
     return {
         "episodes": n_episodes,
         "falls": sum(length < EPISODE_STEPS for length in episodes.lengths),
+        "fallen_at": sorted(length for length in episodes.lengths if length < EPISODE_STEPS),
         "error": round(float(error), 4),
         "turn_error": round(float(turn_error), 4),
         "mean_return": round(float(np.mean(episodes.returns)), 3),
