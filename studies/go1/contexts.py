@@ -8,9 +8,8 @@ falls and errors in our simulation, and in a second one with our motors' table a
     $R --seed 2 --noise 0.1 --dataset-id go1/disturbed-v0
     PYTHONPATH=studies python -m go1.contexts run rows.jsonl --second go1.xml --contexts 1 5 20 50 --seeds 0 1 2
     PYTHONPATH=studies python -m go1.contexts teacher rows.jsonl --second go1.xml --onnx go1_policy.onnx
-    PYTHONPATH=studies python -m go1.contexts report results/other/go1.csv --rows rows.jsonl --figure docs/studies/go1.png
 
-A run that is there already is not repeated. Each appends a row for each simulation.
+A run that is there already is not repeated. Each appends a row for each simulation, which `go1.report` makes a table of.
 """
 
 import argparse
