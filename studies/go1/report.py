@@ -22,7 +22,7 @@ from sb3_dtfm.benchmark.report.statistics import wilson
 
 COLUMNS = (
     *("algo", "label", "context_length", "seed", "simulation", "episodes", "falls", "error", "turn_error", "mean_return"),
-    *("target_return", "n_timesteps", "wall_s", "commit", "settings", "hardware"),
+    *("datasets", "hide_actions", "target_return", "n_timesteps", "wall_s", "commit", "settings", "hardware"),
 )
 SIMULATIONS = tuple(simulations(""))
 
@@ -58,7 +58,9 @@ def write_table(path: Path, rows: Iterable[dict[str, Any]]) -> None:
         writer.writeheader()
         for row in chosen.values():
             told = {name: row.get(name, "") for name in COLUMNS}
-            writer.writerow({name: json.dumps(value) if isinstance(value, dict) else value for name, value in told.items()})
+            writer.writerow(
+                {name: json.dumps(value) if isinstance(value, dict | list) else value for name, value in told.items()}
+            )
 
 
 def read_cells(path: Path) -> Cells:
