@@ -106,8 +106,10 @@ def draw(cells: Cells, label: str, path: Path) -> None:
         for simulation, (color, marker) in zip(SIMULATIONS, STYLES, strict=False):
             shown = [cells[label, "dtfm", context].get(simulation) for context in contexts]
             values = [_value(cell, name) for cell in shown if cell is not None]
+            if not values:
+                continue
             at = [place for place, cell in enumerate(shown) if cell is not None]
-            centres, lows, highs = np.array(values).T if values else np.zeros((3, 0))
+            centres, lows, highs = np.array(values).T
             bars = (centres - lows, highs - centres)
             axis.errorbar(at, centres, bars, color=color, marker=marker, capsize=3, label=simulation)
             if simulation in teacher:
