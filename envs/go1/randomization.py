@@ -21,6 +21,7 @@ class Draw(NamedTuple):
     :param centre: shift of the trunk's centre of mass, (3,) metres
     :param joint_zero: what the joints read where they should read 0, (12,) rad
     :param delay: until a target arrives, as a share of a decision's time
+    :param strength: factors of the motors' torques, (12,)
     """
 
     friction: np.ndarray
@@ -31,9 +32,10 @@ class Draw(NamedTuple):
     centre: np.ndarray
     joint_zero: np.ndarray
     delay: np.ndarray
+    strength: np.ndarray
 
 
-# Range and shape of each, in the order of the draw.
+# Range and shape of each, in the order of the draw; Playground's own, but for the motors' strength, which it leaves alone.
 RANGES: dict[str, tuple[float, float, tuple[int, ...]]] = {
     "friction": (0.4, 1.0, ()),
     "joint_friction": (0.9, 1.1, (12,)),
@@ -43,6 +45,7 @@ RANGES: dict[str, tuple[float, float, tuple[int, ...]]] = {
     "centre": (-0.05, 0.05, (3,)),
     "joint_zero": (-0.05, 0.05, (12,)),
     "delay": (0.0, 1.0, ()),
+    "strength": (0.9, 1.1, (12,)),
 }
 # Largest deviation of what is measured.
 NOISE = {"velocity": 0.1, "gyro": 0.2, "gravity": 0.05, "joint_positions": 0.03, "joint_velocities": 1.5}
@@ -89,7 +92,10 @@ class Randomizer:
     :param simulation: with the robot as it was made
     """
 
-    FIELDS = ("geom_friction", "dof_frictionloss", "dof_armature", "body_mass", "body_inertia", "body_ipos", "qpos0")
+    FIELDS = (
+        *("geom_friction", "dof_frictionloss", "dof_armature", "body_mass", "body_inertia", "body_ipos", "qpos0"),
+        *("actuator_gainprm", "actuator_biasprm"),
+    )
 
     def __init__(self, simulation: Simulation) -> None:
         self._simulation = simulation
@@ -114,6 +120,9 @@ class Randomizer:
         model.body_inertia[links] = made["body_inertia"][links] * share[:, None]
         model.body_ipos[trunk] = made["body_ipos"][trunk] + draw.centre
         model.qpos0[positions] = made["qpos0"][positions] + draw.joint_zero
+        actuators = self._simulation.actuators
+        for name in ("actuator_gainprm", "actuator_biasprm"):
+            getattr(model, name)[actuators] = made[name][actuators] * draw.strength[:, None]
         mujoco.mj_setConst(model, self._simulation.data)
         if not self._simulation.is_delay_fixed:
             self._simulation.delay = round(float(draw.delay) * self._simulation.n_steps)

@@ -65,7 +65,7 @@ class Simulation:
         self.delay = 0  # physics steps until a target arrives, at most those of a decision
         joints = np.array([model.joint(name).id for name in JOINT_NAMES])
         self._positions, self._velocities = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
-        self._actuators = np.array([int(np.flatnonzero(model.actuator_trnid[:, 0] == joint)[0]) for joint in joints])
+        self.actuators = np.array([int(np.flatnonzero(model.actuator_trnid[:, 0] == joint)[0]) for joint in joints])
         self._feet = np.array([model.geom(leg).id for leg in LEGS])
         self._rotation, self._foot_velocity = np.zeros(9), np.zeros(6)
         self._targets = HOME
@@ -111,7 +111,7 @@ class Simulation:
 
         :param targets: of the joints, (12,) rad
         """
-        self.data.ctrl[self._actuators] = targets
+        self.data.ctrl[self.actuators] = targets
 
     def push(self, velocity: np.ndarray) -> None:
         """
@@ -151,7 +151,7 @@ class Simulation:
             gravity=-world_to_trunk[:, 2],
             joint_positions=self.joint_positions,
             joint_velocities=self.joint_velocities,
-            torques=data.actuator_force[self._actuators],
+            torques=data.actuator_force[self.actuators],
             height=float(data.qpos[2]),
             foot_heights=data.geom_xpos[self._feet, 2],
             foot_speeds=np.array([self._foot_speed(foot) for foot in self._feet]),

@@ -165,6 +165,8 @@ def test_the_robot_that_was_drawn_is_simulated():
     np.testing.assert_allclose(model.qpos0[7:], draw.joint_zero)
     assert model.body_subtreemass[0] == pytest.approx(model.body_mass.sum())  # MuJoCo's own sums are made anew
     assert simulation.delay == round(float(draw.delay) * 5)
+    np.testing.assert_allclose(model.actuator_gainprm[:, 0], 35.0 * draw.strength)
+    np.testing.assert_allclose(model.actuator_biasprm[:, 1], -35.0 * draw.strength)
 
 
 def test_without_randomisation_the_robot_stays_as_it_was_made():

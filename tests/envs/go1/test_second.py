@@ -9,6 +9,7 @@ import pytest
 
 from sb3_dtfm.envs.go1.env import Go1Env
 from sb3_dtfm.envs.go1.model import HOME, JOINT_NAMES, build_spec
+from sb3_dtfm.envs.go1.randomization import Randomizer, draw_robot
 from sb3_dtfm.envs.go1.second import MotorSimulation
 from sb3_dtfm.envs.go1.simulation import Simulation
 
@@ -117,6 +118,19 @@ def test_randomisation_finds_the_same_parts_and_leaves_the_delay(tmp_path):
     own.reset(seed=2)
     assert own.simulation.model.body("RR_calf").mass[0] == pytest.approx(masses[-1])
     assert len(set(masses)) == 3
+
+
+@pytest.mark.parametrize("of_others", [False, True])
+def test_strength_multiplies_the_torques_of_its_motors(tmp_path, of_others):
+    simulation = Go1Env(write_model(tmp_path / "go1.xml") if of_others else None).simulation
+    drawn = draw_robot(np.random.default_rng(1))._replace(joint_zero=np.zeros(12))
+    randomizer = Randomizer(simulation)
+    for strength in (np.ones(12), drawn.strength):
+        randomizer.apply(drawn._replace(strength=strength))
+        simulation.reset()
+        simulation.drive(HOME + 0.1)
+        mujoco.mj_forward(simulation.model, simulation.data)
+        np.testing.assert_allclose(simulation.motion.torques, 3.5 * strength)
 
 
 def test_a_joint_of_other_signs_is_refused(tmp_path):

@@ -1,0 +1,53 @@
+"""
+Teachers that are disturbed in ways that `--noise` does not know, so that a velocity is not what its command lets expect.
+
+    R="sb3-dtfm record --algo onnx --model go1_policy.onnx --env Go1Velocity-v0 --gym-packages go1.teachers --episodes 250"
+    PYTHONPATH=studies $R --seed 6 --env-wrapper go1.teachers.Restless --dataset-id go1/restless-v0
+    PYTHONPATH=studies $R --seed 7 --env-wrapper go1.teachers.Dragged --dataset-id go1/dragged-v0
+"""
+
+from typing import Any
+
+import numpy as np
+
+from sb3_dtfm.envs.go1.env import TeacherObservation
+from sb3_dtfm.envs.go1.model import TRUNK
+
+
+class Restless(TeacherObservation):
+    """A teacher whose command is drawn anew each half second, on average."""
+
+    SHARE = 0.04  # of the steps that end a command
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
+        env: Any = self.unwrapped
+        if env.np_random.random() < self.SHARE:
+            env._next_command = 0.0
+        return super().step(action)
+
+
+class Dragged(TeacherObservation):
+    """
+    A teacher whose robot is pulled along the floor, and held back or driven on, by forces that are drawn anew each 2 s on
+    average; it corrects its velocity.
+    """
+
+    SHARE = 0.01  # of the steps that end a force
+    PULL, DRAG = (-15.0, 15.0), (-20.0, 60.0)  # N, and N s/m
+
+    def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        observation, info = super().reset(**kwargs)
+        self._draw()
+        return observation, info
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
+        env: Any = self.unwrapped
+        if env.np_random.random() < self.SHARE:
+            self._draw()
+        data = env.simulation.data
+        data.body(TRUNK).xfrc_applied[:2] = self._pull - self._drag * data.qvel[:2]
+        return super().step(action)
+
+    def _draw(self) -> None:
+        rng = self.unwrapped.np_random
+        self._pull, self._drag = rng.uniform(*self.PULL, 2), rng.uniform(*self.DRAG)

@@ -1,0 +1,50 @@
+"""Disturbed teachers of the Go1: which forces they feel, and how long their commands hold."""
+
+import itertools
+
+import numpy as np
+from go1.teachers import Dragged, Restless
+
+from sb3_dtfm.envs.go1.env import Go1Env
+
+
+def test_a_dragged_robot_feels_its_forces_along_the_floor_and_a_new_episode_none_before_its_first_step():
+    env = Dragged(Go1Env(randomize=False))
+    env.reset(seed=0)
+    data = env.unwrapped.simulation.data
+    pulls = set()
+    for _ in range(300):
+        velocity = data.qvel[:2].copy()
+        env.step(np.zeros(12, np.float32))
+        force = data.body("trunk").xfrc_applied
+        np.testing.assert_allclose(force[:2], env._pull - env._drag * velocity)
+        np.testing.assert_array_equal(force[2:], 0.0)
+        pulls.add(env._drag)
+    assert 1 < len(pulls) < 12
+    assert all(-20.0 <= drag <= 60.0 for drag in pulls)
+    env.reset(seed=0)
+    np.testing.assert_array_equal(data.body("trunk").xfrc_applied, 0.0)
+
+
+def test_a_robot_that_is_held_back_moves_less():
+    moved = []
+    for drag in (0.0, 200.0):
+        env = Dragged(Go1Env(randomize=False))
+        env.reset(seed=0)
+        env.SHARE, env._pull, env._drag = 0.0, np.array([40.0, 0.0]), drag
+        for _ in range(10):
+            env.step(np.zeros(12, np.float32))
+        moved.append(env.unwrapped.simulation.data.qvel[0])
+    assert moved[0] > 2 * moved[1] > 0.0
+
+
+def test_restless_commands_hold_half_a_second():
+    env = Restless(Go1Env(randomize=False))
+    env.reset(seed=0)
+    commands = []
+    for _ in range(1000):
+        env.unwrapped.simulation.reset()
+        observation, *_ = env.step(np.zeros(12, np.float32))
+        commands.append(tuple(observation[-3:]))
+    n_changes = sum(one != two for one, two in itertools.pairwise(commands))
+    assert 25 <= n_changes <= 70
