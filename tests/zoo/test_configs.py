@@ -28,7 +28,7 @@ TARGETS = {
     "robosuite/Square-v0": 1,
 }
 NOT_SEARCHED = {"flow_solver", "one_step_policy", "return_scaling", "return_conditioning", "regression_coef"}
-NOT_SEARCHED |= {"expected_return_steps"}
+NOT_SEARCHED |= {"expected_return_steps", "flow_draws"}  # the data decide these
 HEAD_KEYS = set(FlowHead.options_class.defaults())
 SETTINGS = [None, "paper"]
 
@@ -97,6 +97,7 @@ def test_the_papers_settings():
         "flow_n_layers": 3,
         "flow_prediction": "velocity",
         "flow_tau_exponent": 1.0,
+        "flow_draws": 1,
         "regression_coef": 0.0,
         "one_step_policy": True,
         "flow_solver": "euler",
