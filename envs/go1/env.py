@@ -72,7 +72,7 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
         """
         Begin an episode at the home pose, with another yaw and velocity.
 
-        :param seed: restarts the environment's random stream; without it the stream goes on
+        :param seed: restarts the environment's random stream; without it the stream continues
         :param options: `{"command": (forward, left, turn)}` holds for the whole episode
         """
         super().reset(seed=seed)

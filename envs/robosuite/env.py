@@ -136,7 +136,7 @@ class RobosuiteEnv(gym.Env[Any, np.ndarray]):
         """
         Draw a new start, or take a recorded one.
 
-        :param seed: restarts the environment's random stream; without it the stream goes on
+        :param seed: restarts the environment's random stream; without it the stream continues
         :param options: `{"state": ...}` starts from a recorded :attr:`state`, with none of Wipe's dirt wiped; `"model_file"`
             beside it brings what was recorded of the scene: the size of Lift's cube, the place of the door or of the dirt
         :return: observation and `{"is_success": False}`

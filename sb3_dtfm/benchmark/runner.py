@@ -236,7 +236,7 @@ def run_grid(jobs: Sequence[Job], n_finished: int, options: argparse.Namespace) 
     try:
         runner.run()
     except KeyboardInterrupt:
-        print(f"Interrupted after {len(runner.done)} of {len(jobs)} runs; the same command goes on.", flush=True)
+        print(f"Interrupted after {len(runner.done)} of {len(jobs)} runs; run the same command to continue.", flush=True)
         raise SystemExit(130) from None
     finally:
         signal.signal(signal.SIGTERM, before)

@@ -31,7 +31,7 @@ The file of --datasets maps a task to its dataset, or to some of these keys:
   robosuite/Lift-v0: datasets/lift.hdf5
   cheetah: {task: HalfCheetah-v5, dataset: local/halfcheetah/expert-v0, recorded_from: "TQC, sampled actions"}
 
-A run that is finished in the results folder is not started again; one that was interrupted goes on from its checkpoint.
+A run that is finished in the results folder is not started again; one that was interrupted continues from its checkpoint.
 """
 
 

@@ -1,5 +1,6 @@
 """The cameras of LeRobot datasets: images in Parquet files, or videos."""
 
+import functools
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -106,6 +107,11 @@ class Cameras:
             names = [EPISODE, *(f"videos/{camera}/{each}" for camera in self._videos for each in parts)]
             self._begins = Columns(folder, EPISODES, names, source)
 
+    @functools.cached_property
+    def _image_files(self) -> set[Path]:
+        """Looked for once, and only where a dataset names files: it has one for each step."""
+        return set(files_below(self._folder))
+
     def read(self, camera: str, episode: int, rows: np.ndarray, times: np.ndarray) -> np.ndarray:
         """
         :param camera: one of them
@@ -156,7 +162,7 @@ class Cameras:
         """:param image: the bytes, or a dictionary of them and of the path of a file"""
         if isinstance(image, dict) and image.get("bytes") is None:
             path = self._folder / str(image.get("path"))
-            if path not in files_below(self._folder):
+            if path not in self._image_files:
                 raise DatasetError(f"{where}: there is no image {path}.")
             return path.read_bytes()
         return image["bytes"] if isinstance(image, dict) else image

@@ -263,7 +263,8 @@ class FinetunedManager(FinetuningManager):
             model.save_replay_buffer(os.path.join(self.save_path, "replay_buffer.pkl"))
         if self.signals.asked:
             print(
-                f"Interrupted after {model.num_timesteps} decisions; -i {self.save_path}/{AGENT}.zip goes on in a new run."
+                f"Interrupted after {model.num_timesteps} decisions; "
+                f"-i {self.save_path}/{AGENT}.zip continues it in a new run."
             )
         if self.signals.terminated:
             raise SystemExit(128 + signal.SIGTERM)
@@ -271,7 +272,7 @@ class FinetunedManager(FinetuningManager):
 
 class OnlineManager(FinetuningManager):
     """
-    The DTFM itself goes on learning, as an :class:`~sb3_dtfm.finetuning.OnlineDTFM`. The result is a run of "dtfm".
+    The DTFM itself learns further, as an :class:`~sb3_dtfm.finetuning.OnlineDTFM`. The result is a run of "dtfm".
 
     The dataset is that of the DTFM's run. Own episodes are kept beside the model; who goes on from there takes them up.
     """
@@ -282,7 +283,9 @@ class OnlineManager(FinetuningManager):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         if self.continue_training and not self.has_checkpoint:
-            raise UsageError(f"-i {self.trained_agent}: --model names what goes on; its run's own episodes come with it.")
+            raise UsageError(
+                f"-i {self.trained_agent}: --model names the model to fine-tune; its run's own episodes come with it."
+            )
         if not self.has_checkpoint:
             self.trained_agent, self.continue_training = str(self.base_file), True
         self.save_replay_buffer = False  # it is, as episodes.npz

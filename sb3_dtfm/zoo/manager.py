@@ -290,7 +290,8 @@ class OfflineExperimentManager(ExperimentManager):
             if self.signals.asked and not midst_of_a_step:
                 self.keeper.save()
             print(
-                f"Interrupted after {model.num_timesteps} steps; sb3-dtfm {self.command} --resume {self.save_path} goes on."
+                f"Interrupted after {model.num_timesteps} steps; "
+                f"sb3-dtfm {self.command} --resume {self.save_path} continues it."
             )
         if self.keeper is not None:
             self.keeper.release()

@@ -79,13 +79,13 @@ class Start(NamedTuple):
             raise UsageError(f"--resume {run}: {START} is damaged: {error}.") from error
         if start.command != command:
             raise UsageError(
-                f"--resume {run}: `sb3-dtfm {start.command}` started it; sb3-dtfm {start.command} --resume goes on."
+                f"--resume {run}: `sb3-dtfm {start.command}` started it; sb3-dtfm {start.command} --resume continues it."
             )
         if start.has_checkpoint and not (run / CHECKPOINT).is_file():
             models = sorted(run.glob("[!.]*.zip"), key=os.path.getmtime)
             copied = f", or copy the run's newest model there: cp {models[-1]} {run / CHECKPOINT}" if models else ""
             raise UsageError(
-                f"--resume {run}: {CHECKPOINT} is missing, from which the run goes on; it would begin anew and replace what "
+                f"--resume {run}: {CHECKPOINT} is missing, where the run continues; it would begin anew and replace what "
                 f"it has learned. Put the file back{copied}."
             )
         return start

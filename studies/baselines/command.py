@@ -5,7 +5,7 @@ DT, DTFM and their baselines, trained and evaluated on the same data and initial
     make baselines ARGUMENTS="--data can-few --algo dt dtfm bc --seeds 0"    # some of it
     python studies/summary.py mine                                      # the rows as a table
 
-A run that is finished in the results folder is not started again; a kill loses at most the running one (ours goes on from
+A run that is finished in the results folder is not started again; a kill loses at most the running one (ours continues from
 its checkpoint). Two calls of the command, one for each core, share the runs between them.
 """
 
@@ -233,7 +233,7 @@ def main(argv: Sequence[str]) -> None:
                 train_and_evaluate(data, baseline, seed, options) for baseline in baselines if data.kind in baseline.only
             )
     if n_left:
-        print("Some runs failed, or are left to other processes; the same command goes on.")
+        print("Some runs failed, or are left to other processes; run the same command to continue.")
         raise SystemExit(1)
     print(f"All runs are finished: python studies/summary.py {options.results}")
 
@@ -249,7 +249,7 @@ def run() -> None:
         main(sys.argv[1:])
     except KeyboardInterrupt:
         with contextlib.suppress(BrokenPipeError):
-            print("Interrupted; the same command goes on.", flush=True)
+            print("Interrupted; run the same command to continue.", flush=True)
         raise SystemExit(130) from None
     except UsageError as error:
         raise SystemExit(f"baselines: {error}") from None

@@ -138,7 +138,7 @@ pathlib.Path(arguments["rows"]).write_text(json.dumps({{**arguments["row"], **ev
 
 @pytest.fixture
 def stub(workplace, monkeypatch):
-    """Runs that do nothing; `dtfm` does what is asked."""
+    """Runs that do nothing; `dtfm` runs the given function."""
 
     def use(instead: str) -> None:
         (workplace / "stub.py").write_text(STUB.format(instead=instead))

@@ -222,7 +222,7 @@ def test_online_learning_that_was_interrupted_goes_on(run, workplace, capsys, mo
         with pytest.raises(SystemExit, match="143"):
             main([*command, "--eval-freq", "40", "--eval-episodes", "2"])
     online = workplace / "logs/dtfm/HalfCheetah-v5_2"
-    assert f"sb3-dtfm finetune --resume {online.relative_to(workplace)} goes on." in capsys.readouterr().out
+    assert f"sb3-dtfm finetune --resume {online.relative_to(workplace)} continues it." in capsys.readouterr().out
     n_before = load_dataset(online / "episodes.npz").n_episodes
     assert n_before == 4
     assert main(["train", "--resume", str(online)]) == 2
@@ -276,7 +276,7 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
         f"--model {run} --algo td3": "--algo td3: no packaged settings; those of dtfm, ppo, sac, tqc are.",
         "--model alone.zip --algo dtfm --target-return 3": "dataset:...: needed, as alone.zip does not tell what it learned",
         f"--model {run} --algo dtfm -params n_episods:3": "n_episods (did you mean n_episodes?): no hyperparameter of",
-        f"--model {run} --algo dtfm -i alone.zip": "-i alone.zip: --model names what goes on",
+        f"--model {run} --algo dtfm -i alone.zip": "-i alone.zip: --model names the model to fine-tune",
         f"--model {run} --algo dtfm -params verbose:0": "verbose: no hyperparameter of finetune --algo dtfm.",
         f"--model {run} --algo dtfm -params policy_kwargs:dict(n_action_samples=4)": "policy_kwargs: are those of the model",
         f"--model {run} --algo dtfm -params n_action_samples:4": "policy_kwargs: are those of the model",
