@@ -57,7 +57,7 @@ def test_a_model_with_hidden_actions_does_not_depend_on_them(tmp_path):
         for _ in range(3)
     ]
     model = DTFM("MultiInputPolicy", dataset=episodes, context_length=3, batch_size=4, seed=0, device="cpu")
-    hide_actions(model)
+    hide_actions(model, everywhere=True)
     model.learn(3)
 
     def act(actions):
