@@ -3,7 +3,9 @@
 from sb3_dtfm.envs.robosuite.env import RobosuiteEnv
 from sb3_dtfm.envs.robosuite.registration import (
     arm_controller,
+    arm_motion,
     differences_from_robomimic,
+    differences_in_motion,
     env_id_from_robomimic,
     env_kwargs_from_robomimic,
     register_robosuite_envs,
@@ -15,7 +17,9 @@ __all__ = [
     "RobosuiteEnv",
     "RobosuiteTask",
     "arm_controller",
+    "arm_motion",
     "differences_from_robomimic",
+    "differences_in_motion",
     "env_id_from_robomimic",
     "env_kwargs_from_robomimic",
     "register_robosuite_envs",

@@ -85,17 +85,35 @@ def differences_from_robomimic(
     :return: by the name of each field that differs, its value in the file and ours; a field that is missing counts as that
         of a registered environment
     """
-    theirs, own = _motion(env_args), _motion(ours or {})
-    differences = {}
-    for name, value in theirs.items():
-        numbers = type(CONTROLLER.get(name)) in (int, list) and None not in (value, own[name])  # one for all, or for each
-        if not (np.allclose(value, own[name]) if numbers else value == own[name]):
-            differences[name] = value, own[name]
-    return differences
+    return differences_in_motion(arm_motion(env_args), arm_motion(ours or {}))
 
 
-def _motion(env_args: str | dict[str, Any]) -> dict[str, Any]:
-    """What an action does, by robosuite's names."""
+def differences_in_motion(motion: dict[str, Any], ours: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """
+    Compare what actions do, as :func:`arm_motion` has it.
+
+    :param motion: of the data; plain values of any kind
+    :param ours: of an environment
+    :return: by the name of each field that differs, its two values
+    """
+    pairs = {name: (motion.get(name, own), own) for name, own in ours.items()}
+    return {name: pair for name, pair in pairs.items() if not _alike(*pair)}
+
+
+def _alike(value: Any, ours: Any) -> bool:
+    try:
+        return bool(np.allclose(value, ours))  # one number for all, or for each
+    except (TypeError, ValueError, OverflowError):  # no numbers, or not as many
+        return bool(value == ours)
+
+
+def arm_motion(env_args: str | dict[str, Any]) -> dict[str, Any]:
+    """
+    Robot, controller and control frequency, on which the effect of an action depends, by robosuite's names.
+
+    :param env_args: as for :func:`env_id_from_robomimic`
+    :return: plain values; a field that is missing is that of a registered environment
+    """
     kwargs = _parsed(env_args)[1].get("env_kwargs", {})
     arm, robots = arm_controller(kwargs), kwargs.get("robots", "Panda")
     motion = {name: arm.get(name, arm.get(OLD_NAMES.get(name, name), ours)) for name, ours in CONTROLLER.items()}

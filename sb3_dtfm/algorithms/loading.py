@@ -182,6 +182,8 @@ def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
     accepted = known and all(rule.accepts(value) for rule, value in zip(RETURN_REFERENCE, returns, strict=True))
     if returns is not None and not accepted:
         raise ModelFileError(f"{source}: return_reference is {returns}, expected {', '.join(ReturnReference._fields)}.")
+    if not isinstance(controller := attributes.get("controller"), dict | None):
+        raise ModelFileError(f"{source}: controller is {controller!r:.40}, expected settings by robosuite's names, or None.")
     with wrap_file_errors(source):
         check_arguments(attributes, {name: rule for name, rule in SAVED.items() if name in attributes})
     observation, action = attributes["observation_space"], attributes["action_space"]

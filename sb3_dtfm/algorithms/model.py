@@ -29,7 +29,14 @@ from sb3_dtfm.algorithms.saving import (
     to_configuration,
 )
 from sb3_dtfm.arguments import NOT_NEGATIVE, POSITIVE, Number, Rule, check_arguments
-from sb3_dtfm.data import DatasetError, ReturnReference, ScoreReference, TrajectoryBuffer, check_action_space
+from sb3_dtfm.data import (
+    DatasetError,
+    ReturnReference,
+    ScoreReference,
+    TrajectoryBuffer,
+    check_action_space,
+    check_controller,
+)
 from sb3_dtfm.distributed import check_batch_size, is_first_process
 from sb3_dtfm.envs import ReturnToGoWrapper, channels_first, check_vec_env, image_spaces, known_task, share_target_return
 from sb3_dtfm.files import ModelFile, ModelFileError, file_name, holds_pickles, read_model, write_model, write_onnx
@@ -64,6 +71,8 @@ class SequenceModel(BaseAlgorithm):
     :param device: "auto", "cpu" or "cuda"
     :ivar target_return: for acting, environment reward units; given to each environment of the model that is wrapped
         without a target. None where a file does not tell
+    :ivar controller: robot, controller and control frequency of the dataset's actions, by robosuite's names, which an
+        environment must have, too; None where the data do not tell, or are meant for another environment (`env_id`)
     :ivar buffer: what it learns from, None where a model only acts
     """
 
@@ -112,6 +121,7 @@ class SequenceModel(BaseAlgorithm):
         self.max_timestep = 1000
         self.score_reference: ScoreReference | None = None
         self.return_reference: ReturnReference | None = None
+        self.controller: dict[str, Any] | None = None
         self.buffer: TrajectoryBuffer | None = None
         self._means = RunningMeans()
         self._last_saved: str | None = None  # by this object
@@ -210,6 +220,7 @@ class SequenceModel(BaseAlgorithm):
         self._check_spaces(vec_env.observation_space, action_space, "The environment has", "the model's are")
         if self.buffer is not None:
             self._check_task(self.buffer, vec_env)
+        self.check_controller(vec_env)
         self.observation_space, self.action_space = vec_env.observation_space, action_space
         self.n_envs = vec_env.num_envs
         self.target_return = share_target_return(vec_env, self.target_return)
@@ -240,6 +251,16 @@ class SequenceModel(BaseAlgorithm):
         """
         if (task := known_task(env)) is not None:
             buffer.check_task(task.env_id)
+
+    def check_controller(self, env: VecEnv, name: str = "the environment") -> None:
+        """
+        Refuse an environment in which an action does something else than in the data.
+
+        :param env: wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
+        :param name: of the environment, for messages
+        :raises DatasetError: its robot, controller or control frequency is another than :attr:`controller`
+        """
+        check_controller(self.controller, env.get_attr("env_args", [0])[0], name)
 
     @classmethod
     def load(

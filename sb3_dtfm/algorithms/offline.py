@@ -16,7 +16,7 @@ from sb3_dtfm.algorithms.model import POLICY_NAMES, SequenceModel
 from sb3_dtfm.algorithms.options import TrainingOptions
 from sb3_dtfm.arguments import POSITIVE, documented_parameters
 from sb3_dtfm.callbacks import GradientStepProgressBar, TimeLeft, combine_callbacks
-from sb3_dtfm.data import Dataset, TrajectoryBuffer, load_dataset, without_pickles
+from sb3_dtfm.data import Dataset, TrajectoryBuffer, check_controller, load_dataset, without_pickles
 from sb3_dtfm.data.decisions import Decision, decide_open, sentences
 from sb3_dtfm.data.inspection import return_reference, suggested_target_return
 from sb3_dtfm.distributed import (
@@ -185,7 +185,7 @@ class OfflineAlgorithm(SequenceModel):
             )
         if self.env is not None and (task := known_task(self.env)) is not None:
             self.time_limit = task.max_episode_steps
-        known = {"action_space": getattr(self, "action_space", None), "max_episode_steps": self.time_limit}
+        known: dict[str, Any] = {"action_space": getattr(self, "action_space", None), "max_episode_steps": self.time_limit}
         if self.env is not None:
             known.update(observation_space=recorded_space(self.env), env_args=self.env.get_attr("env_args", [0])[0])
         with local_rank_zero_first():
@@ -197,6 +197,7 @@ class OfflineAlgorithm(SequenceModel):
         self._check_spaces(observation_space, buffer.action_space, f"{buffer.source} holds", "the environment's are")
         if self.env is not None:
             self._check_task(buffer, self.env)
+            check_controller(buffer.controller, known["env_args"], source=buffer.source)
         if self.target_return is None:
             self.target_return = suggested_target_return(buffer)
             if self.env is not None:
@@ -204,7 +205,7 @@ class OfflineAlgorithm(SequenceModel):
                 if self.verbose >= 1 and is_first_process():
                     chosen = f"The environment has target_return={self.target_return:g}"
                     print(f"{chosen}, as `sb3-dtfm inspect` suggests of the recorded returns.", flush=True)
-        self.return_reference = return_reference(buffer)
+        self.return_reference, self.controller = return_reference(buffer), buffer.controller
         return buffer
 
     def _learn_from(self, buffer: TrajectoryBuffer) -> TrajectoryBuffer:
@@ -230,6 +231,7 @@ class OfflineAlgorithm(SequenceModel):
         for evaluation in evaluations:
             name, remedy = "The evaluation environment of EvalCallback", "EvalCallback(ReturnToGoWrapper(eval_env), ...)"
             check_vec_env(evaluation.eval_env, name, remedy)
+            self.check_controller(evaluation.eval_env, "the environment of EvalCallback")
             share_target_return(evaluation.eval_env, self.target_return)
         if self.env is None and evaluations:  # SB3's callbacks ask the model for an environment
             self.n_envs = evaluations[0].eval_env.num_envs

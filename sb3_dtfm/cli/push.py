@@ -74,6 +74,7 @@ def evaluate(model: FoundModel, agent: AgentFiles, options: argparse.Namespace) 
     env = make_vec_env(options.env.gym_id, seed=options.seed, env_kwargs=agent.env_kwargs, wrapper_class=agent.wrapper)
     try:
         trained = ALGORITHMS[options.algo].load(model.path, device="cpu")
+        trained.check_controller(env)
         mean, deviation = evaluate_policy(trained, env, n_eval_episodes=options.n_eval_episodes)
     finally:
         env.close()

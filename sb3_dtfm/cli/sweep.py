@@ -171,6 +171,7 @@ def sweep(
         wrapper_class=lambda env: SeededEpisodes(wrap(env)),
         env_kwargs={**agent.env_kwargs, **key_values("--env-kwargs", options.env_kwargs)},
     )
+    model.check_controller(vec_env)  # type: ignore[attr-defined]
     first = first_state(options)
     reached = []
     for target in targets:

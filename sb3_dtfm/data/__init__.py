@@ -8,7 +8,7 @@ from sb3_dtfm.data.lerobot import load_lerobot
 from sb3_dtfm.data.minari import load_minari
 from sb3_dtfm.data.pickles import without_pickles
 from sb3_dtfm.data.readers import Dataset, load_dataset
-from sb3_dtfm.data.robomimic import load_robomimic
+from sb3_dtfm.data.robomimic import check_controller, load_robomimic
 from sb3_dtfm.data.trajectories import (
     DatasetError,
     ReturnReference,
@@ -27,6 +27,7 @@ __all__ = [
     "Trajectory",
     "TrajectoryBuffer",
     "check_action_space",
+    "check_controller",
     "load_dataset",
     "load_episodes",
     "load_flat",

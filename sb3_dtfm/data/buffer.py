@@ -5,6 +5,7 @@ import os
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -53,6 +54,8 @@ class TrajectoryBuffer(FlatSteps):
     :ivar episodes: the buffer's episodes, one row each
     :ivar weights: (E,) float64, how often a step of each is drawn beside one of weight 1
     :ivar env_id: Gymnasium id of the environment that they come from, None if unknown
+    :ivar controller: robot, controller and control frequency that the actions were recorded with, by robosuite's names;
+        None where the data do not tell
     :ivar dropped: how many episodes `on_invalid="drop"` has left out, and why the first of them; None where it had none
     :ivar device: what batches are made for
     """
@@ -77,6 +80,7 @@ class TrajectoryBuffer(FlatSteps):
         self.source = source
         self.score_reference = score_reference
         self.env_id = env_id
+        self.controller: dict[str, Any] | None = None
         self.dropped = dropped
         if dropped:
             n_all = dropped[0] + len(episodes.lengths)
@@ -421,6 +425,7 @@ class TrajectoryBuffer(FlatSteps):
         table = table._replace(starts=np.cumsum(table.lengths) - table.lengths)
         about = (first.observation_space, first.action_space, source)
         joined = cls(tensors, table, *about, env_id=named.env_id, image_spaces=first.image_spaces)
+        joined.controller = next((each.controller for each in buffers if each.controller is not None), None)
         if len({buffer.score_reference for buffer in buffers}) == 1:
             joined.score_reference = first.score_reference
         if dropped := [buffer.dropped for buffer in buffers if buffer.dropped]:

@@ -25,7 +25,7 @@ from sb3_dtfm.data.storage import STEP_ARRAYS, WRITE_BUFFER, FileStorage, Mapped
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference
 
 # Counts up whenever what is stored, or what the readers make of a dataset, changes: older caches are then built anew.
-FORMAT = 8
+FORMAT = 9
 DESCRIPTION = "cache.json"
 EPISODES = "episodes.npz"
 SPACES = ("observation_space", "action_space")
@@ -171,6 +171,7 @@ def _build(folder: Path, fingerprint: Fingerprint, read: Callable[[FileStorage],
             "fingerprint": fingerprint._asdict(),
             "source": buffer.source,
             "env_id": buffer.env_id,
+            "controller": buffer.controller,
             "score_reference": buffer.score_reference,
             "n_steps": len(buffer),
             "images": {camera: list(space.shape) for camera, space in buffer.image_spaces.items()},
@@ -239,7 +240,7 @@ def open_cache(folder: Path) -> TrajectoryBuffer:
     maps = {name: _checked_map(folder, name, (n_steps, *shapes.get(name, ()))) for name in (*STEP_ARRAYS, *images)}
     for steps in maps.values():
         steps.check = check
-    return TrajectoryBuffer(
+    buffer = TrajectoryBuffer(
         {name: steps.tensor for name, steps in maps.items()},
         episodes,
         observation_space,
@@ -251,6 +252,8 @@ def open_cache(folder: Path) -> TrajectoryBuffer:
         dropped=description["dropped"],
         image_spaces=images,
     )
+    buffer.controller = description["controller"]
+    return buffer
 
 
 def _file_digest(path: Path) -> str:

@@ -208,7 +208,7 @@ def load_dataset(
         )
     if env_id is not None:
         buffer = copy.copy(buffer)
-        buffer.env_id = env_id
+        buffer.env_id, buffer.controller = env_id, None
     if max_episode_steps is not None:
         buffer = buffer.within(max_episode_steps)
     return buffer.best(min_return, best_share, success_only).random_fraction(fraction, fraction_seed)

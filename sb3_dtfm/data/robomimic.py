@@ -19,7 +19,7 @@ from sb3_dtfm.data.hdf5 import check_within, listed, open_group, open_hdf5, read
 from sb3_dtfm.data.observations import Observed, is_images, observed
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_finite, check_flags, wrap_dataset_errors
-from sb3_dtfm.envs.robosuite import arm_controller, differences_from_robomimic, env_id_from_robomimic
+from sb3_dtfm.envs.robosuite import arm_controller, arm_motion, differences_in_motion, env_id_from_robomimic
 
 DEFAULT_OBSERVATION_KEYS = ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos", "object")
 EXPECTED = "the path of a robomimic hdf5 file"
@@ -169,7 +169,7 @@ def _read(
                 name=name,
             )
 
-    return TrajectoryBuffer.from_trajectories(
+    buffer = TrajectoryBuffer.from_trajectories(
         map(trajectory, demos),
         action_space=action_space,
         n_steps=sum(len(rewards[name]) for name in demos if name in rewards),
@@ -179,6 +179,8 @@ def _read(
         on_invalid=on_invalid,
         n_stored=os.path.getsize(source),
     )
+    buffer.controller = None if env_id is None else arm_motion(env_args)
+    return buffer
 
 
 def _number(name: str) -> tuple[int, str]:
@@ -212,15 +214,38 @@ def _env_id(recorded: dict[str, Any], source: str, env_id: str | None, env_args:
     """Our environment of the file's task; if no id says what the file is meant for, its actions have to do the same."""
     with wrap_dataset_errors(f"{source}: attribute 'env_args' of group 'data'"):
         own_id = env_id_from_robomimic(recorded)
-        differences = {} if own_id is None or env_id else differences_from_robomimic(recorded, env_args)
-    if differences:
-        found = ", ".join(f"{name} is {theirs!r} instead of {ours!r}" for name, (theirs, ours) in differences.items())
-        raise DatasetError(
-            f"{source}: an action does something else than in {'the environment' if env_args else own_id}: {found}. Give an "
-            "environment with the file's settings (sb3_dtfm.envs.robosuite.env_kwargs_from_robomimic), or say what the "
-            "actions are meant for, dataset_kwargs={'env_id': ...}."
-        )
+        if own_id is not None and not env_id:
+            name = "the environment" if env_args else own_id
+            check_controller(arm_motion(recorded), env_args or {}, name, source)
     return own_id
+
+
+def check_controller(
+    controller: dict[str, Any] | None,
+    env_args: dict[str, Any] | None,
+    name: str = "the environment",
+    source: str | None = None,
+) -> None:
+    """
+    Refuse an environment in which an action does something else than where the data were recorded.
+
+    :param controller: of the data, see :class:`~sb3_dtfm.data.TrajectoryBuffer`; None where they do not tell
+    :param env_args: the environment's, see :func:`load_robomimic`; None where it does not tell
+    :param name: of the environment, for messages
+    :param source: of the data, for messages; None for those of a model
+    :raises DatasetError: robot, controller or control frequency differ
+    """
+    if controller is None or env_args is None:
+        return
+    if differences := differences_in_motion(controller, arm_motion(env_args)):
+        found = ", ".join(f"{field} is {theirs!r} instead of {ours!r}" for field, (theirs, ours) in differences.items())
+        insist = "say what the actions are meant for, dataset_kwargs={'env_id': ...}"
+        if source is None:
+            source, insist = "The model's data", "load the model with controller=None, to act there all the same"
+        raise DatasetError(
+            f"{source}: an action does something else than in {name}: {found}. Give an environment with the data's settings "
+            f"(sb3_dtfm.envs.robosuite.env_kwargs_from_robomimic), or {insist}."
+        )
 
 
 def _check_count(group: h5py.Group, name: str, n_steps: int, where: str) -> None:

@@ -52,6 +52,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
         action_space = self._action_space(model.policy, float(bound))
         check_vec_env(venv)
         model._check_spaces(venv.observation_space, venv.action_space, "The environment has", "the model's are")  # type: ignore[arg-type]
+        model.check_controller(venv)
         share_target_return(venv, model.target_return)
         n_shown = self._n_shown(model.policy) + (model.policy.options.embed_dim if hidden_state else 0)
         super().__init__(venv, spaces.Box(-OBSERVATION_CLIP, OBSERVATION_CLIP, (n_shown,), np.float32), action_space)

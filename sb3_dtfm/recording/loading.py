@@ -23,6 +23,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.algorithms.model import SequenceModel
 from sb3_dtfm.algorithms.saving import head_name
+from sb3_dtfm.data import check_controller
 from sb3_dtfm.envs import channels_first, image_spaces
 from sb3_dtfm.files import holds_pickles, read_configuration, read_run
 from sb3_dtfm.finetuning import FINETUNED, FinetunedDTFM
@@ -199,6 +200,8 @@ def load_fitting_agent(
         if _shapes(agent_space) != _shapes(env_space):
             env_id = env.spec.id if env.spec else env
             raise ValueError(f"{files.model.name} was trained with {kind} {agent_space}, but {env_id} has {env_space}.")
+    if isinstance(model, SequenceModel):
+        check_controller(model.controller, getattr(env.unwrapped, "env_args", None))
     if vec_normalize_path == NOT_NORMALIZED:
         return model, None
     if vec_normalize_path is None and files.vec_normalize is None:

@@ -19,6 +19,7 @@ from huggingface_sb3 import EnvironmentName
 from rl_zoo3.utils import create_test_env, get_model_path
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_dtfm.data import check_controller
 from sb3_dtfm.files import holds_pickles, read_configuration, settings_loader
 from sb3_dtfm.zoo.arguments import Restored, StoreLiterals, StoreValues
 from sb3_dtfm.zoo.comparison import EpisodesOf, compare
@@ -136,8 +137,16 @@ def record_video(model: FoundModel, arguments: Sequence[str]) -> None:
 
 
 def _without_pickles(model: FoundModel, *args: Any, **kwargs: Any) -> VecEnv:
-    """RL-Zoo's `create_test_env`; VecNormalize's pickled statistics are loaded only beside a model that is a pickle, too."""
-    return create_test_env(*args, **kwargs if holds_pickles(model.path) else {**kwargs, "stats_path": None})
+    """
+    RL-Zoo's `create_test_env`; VecNormalize's pickled statistics are loaded only beside a model that is a pickle, too.
+
+    :raises DatasetError: an action does something else there than in the data of the model
+    """
+    if holds_pickles(model.path):
+        return create_test_env(*args, **kwargs)
+    env = create_test_env(*args, **{**kwargs, "stats_path": None})
+    check_controller(read_configuration(model.path)["attributes"].get("controller"), env.get_attr("env_args", [0])[0])
+    return env
 
 
 def plot(name: str, arguments: Sequence[str]) -> None:

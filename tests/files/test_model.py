@@ -268,6 +268,7 @@ BAD_CONFIGURATIONS = [
     (("attributes", "return_reference"), [1.0, "x", 2.0, 3, False, None, None], "return_reference is [1.0, 'x'"),
     (("attributes", "return_reference"), [1.0, 2.0, 2.0, 3, False, 1.5, None], "expected recorded, best_tenth, best, n_"),
     (("attributes", "return_reference"), [1.0, 2.0, 2.0, 3, 0.5, None, None], "expected recorded, best_tenth, best, n_"),
+    (("attributes", "controller"), "kp", "controller is 'kp'"),
     (("attributes", "policy_kwargs"), 7, "policy_kwargs"),
     (("attributes", "dataset_kwargs"), {"cache_dir": "/etc"}, "without cache_dir and allow_pickle"),
     (("attributes", "dataset_kwargs"), {"allow_pickle": True}, "without cache_dir and allow_pickle"),
@@ -358,7 +359,7 @@ def test_a_directory_that_leads_nowhere_is_refused(saved, tmp_path):
 
 def test_each_attribute_in_a_file_has_a_rule(saved):
     """So that no file sets what nobody looks at."""
-    own = {*TrainingOptions.defaults(), "policy_kwargs", "dataset_kwargs", "score_reference", "return_reference"}
+    own = {"policy_kwargs", "dataset_kwargs", "score_reference", "return_reference", "controller"}
     assert set(json.loads(members(saved)["model.json"])["attributes"]) <= {
         *SAVED,
         *ACCEPTED,

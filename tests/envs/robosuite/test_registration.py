@@ -12,7 +12,9 @@ from sb3_dtfm.data import DatasetError
 from sb3_dtfm.envs.robosuite import (
     TASKS,
     RobosuiteEnv,
+    arm_motion,
     differences_from_robomimic,
+    differences_in_motion,
     env_id_from_robomimic,
     env_kwargs_from_robomimic,
     register_robosuite_envs,
@@ -87,6 +89,13 @@ def test_controller_of_an_old_robomimic_file_moves_like_the_default(lift):
     env = RobosuiteEnv(**env_kwargs_from_robomimic(env_args))
     np.testing.assert_array_equal(rollout(env, seed=2), rollout(lift, seed=2))
     env.close()
+
+
+@pytest.mark.parametrize("value", ["high", None, {}, [[1], [2, 3]], 10**400, [150] * 5 + [151], float("nan")])
+def test_whatever_a_file_says_differs_or_not(value):
+    ours = arm_motion({})
+    assert differences_in_motion({"kp": value, "unheard_of": 1}, ours) == {"kp": (value, 150)}
+    assert differences_in_motion({"kp": [150.0] * 6}, ours) == {}
 
 
 @pytest.mark.parametrize("task", ["Lift", "Can", "Wipe"])
