@@ -6,6 +6,7 @@ lead to the repository at the version's tag, `pyproject.toml` has project URLs a
 The paths are GitHub's, `ADDRESS/blob/TAG/FILE` and `ADDRESS/raw/TAG/FILE`.
 """
 
+import argparse
 import re
 import shutil
 import sys
@@ -57,9 +58,11 @@ def copy_with_address(address: str, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 3:
-        sys.exit(__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("address", help="https://github.com/OWNER/NAME")
+    parser.add_argument("folder", type=Path, help="to be made")
+    options = parser.parse_args()
     try:
-        copy_with_address(sys.argv[1], Path(sys.argv[2]))
+        copy_with_address(options.address, options.folder)
     except (ValueError, FileExistsError) as error:
         sys.exit(str(error))

@@ -4,6 +4,7 @@ Sizes that this project keeps, printed by `make lint`, which fails where one is 
 A word is what has a letter or a digit between two spaces; lines of code blocks and tables do not count as prose.
 """
 
+import argparse
 import ast
 import re
 import subprocess
@@ -109,4 +110,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     main()

@@ -5,6 +5,7 @@ Both are asked in turn for the same observations, one environment with a full co
 what `examples/deploy.py` takes with ONNX Runtime, its own bookkeeping included, and what `model.predict` takes.
 """
 
+import argparse
 import statistics
 import sys
 import tempfile
@@ -69,4 +70,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     main()

@@ -15,8 +15,8 @@ Walls and target stay where they are when the scene is mirrored at the target's 
 are written as they were recorded, and mirrored.
 """
 
+import argparse
 import os
-import sys
 from typing import Any
 
 import gymnasium as gym
@@ -159,4 +159,7 @@ def main(source: str, target: str | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("source", help="recorded by people, .npz or .zarr.zip")
+    parser.add_argument("target", nargs="?", help=".npz file to write")
+    main(**vars(parser.parse_args()))

@@ -38,10 +38,11 @@ def reached(run: Run, n_steps: float) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", nargs=2, type=Path, metavar=("QUICK", "SLOW"))
+    parser.add_argument("quick", type=Path, help="CSV file of results, or folder of rows")
+    parser.add_argument("slow", type=Path, help="CSV file of results, or folder of rows")
     parser.add_argument("--labels", nargs=2, default=("", ""), metavar=("QUICK", "SLOW"))
     arguments = parser.parse_args()
-    quick, slow = (runs_of(*which) for which in zip(arguments.folders, arguments.labels, strict=True))
+    quick, slow = (runs_of(*which) for which in zip((arguments.quick, arguments.slow), arguments.labels, strict=True))
     print("| task | data | algorithm | minutes | whole, seed by seed | cut short |\n| --- | --- | --- | --- | --- | --- |")
     for key in sorted(quick.keys() & slow.keys()):
         task, share, algo = key

@@ -5,7 +5,7 @@ The results of a study as a table: a line for each task, share and algorithm, a 
     python studies/summary.py results/*.csv             # of several, what results/README.md says of each
 """
 
-import sys
+import argparse
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -102,5 +102,7 @@ def _markdown(found: Sequence[dict[str, str]], header: Sequence[str]) -> str:
 
 
 if __name__ == "__main__":
-    paths = [Path(argument) for argument in sys.argv[1:]]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("paths", nargs="+", type=Path, help="CSV files of results, or folders of rows")
+    paths = parser.parse_args().paths
     print(table(*paths) if len(paths) == 1 else _markdown(each := [about(path) for path in paths], list(each[0])))

@@ -39,13 +39,13 @@ def flat(arrays: dict[str, np.ndarray], env_id: str) -> dict[str, np.ndarray]:
 
 def main() -> None:
     """See the top."""
-    from ogbench.relabel_utils import relabel_dataset
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task", help="cube-single, scene, puzzle-3x3, ...")
     parser.add_argument("dataset", type=Path, help="the play set, .npz")
     parser.add_argument("--tasks", type=int, nargs="+", choices=TASKS, default=list(TASKS), metavar="N", help="1 to 5")
     options = parser.parse_args()
+    from ogbench.relabel_utils import relabel_dataset  # not needed for --help
+
     arrays = load(options.dataset)
     for number in options.tasks:
         path = options.dataset.with_name(f"{options.task}-play-task{number}-v0.npz")

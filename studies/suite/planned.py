@@ -4,6 +4,7 @@ A ball that a planner leads through a maze: the shortest way over the cells, fol
     python studies/suite/planned.py
 """
 
+import argparse
 from collections import deque
 
 import gymnasium as gym
@@ -79,4 +80,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     main()
