@@ -1,5 +1,5 @@
 """
-What a release is built from, with the repository's address in it: `python docs/addresses.py ADDRESS FOLDER`.
+Copy what a release is built from, with the repository's address in it: `python docs/addresses.py ADDRESS FOLDER`.
 
 PyPI shows README without the files beside it. So in the copy that this makes in an empty folder, README's links and images
 lead to the repository at the version's tag, `pyproject.toml` has project URLs and `CITATION.cff` names the repository.

@@ -1,5 +1,5 @@
 """
-What MkDocs does not do by itself: files beside docs/ that the pages link, equations without JavaScript, docstrings' roles.
+Hooks for MkDocs: files beside docs/ that the pages link, equations without JavaScript, docstrings' roles.
 
 The site holds docs/ at its root, and each linked file beside it under its own path; of a linked folder, its README.
 """
@@ -57,7 +57,7 @@ def on_page_content(content: str, page: Page, config: MkDocsConfig, files: Files
 
 
 def _source(page: str) -> str:
-    """Where a page of the site lies in the repository."""
+    """Return where a page of the site lies in the repository."""
     inside = f"docs/{page}"
     return inside if (ROOT / inside).is_file() else page
 

@@ -70,7 +70,7 @@ def n_arguments(path: str, name: str) -> int:
 
 
 def subjects() -> list[str]:
-    """Of the commits since the rule began; none in a copy without a history."""
+    """Subjects of the commits since the rule began; none in a copy without a history."""
     command = ["git", "-C", str(ROOT), "log", "--no-merges", "--format=%s", f"{SUBJECTS_SINCE}..HEAD"]
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout.splitlines()
 

@@ -223,12 +223,12 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     @property
     def known_task(self) -> Task | None:
-        """What Gymnasium knows of it, in words that pass between processes, where the whole `spec` may not."""
+        """Gymnasium's id and time limit of the task, which pass between processes, where the whole `spec` may not."""
         return None if self.spec is None else Task(self.spec.id, self.spec.max_episode_steps)
 
     @property
     def env_args(self) -> dict[str, Any] | None:
-        """How the environment describes itself as robomimic's files do; None where it does not."""
+        """The environment's description of itself in the words of robomimic's files; None where it has none."""
         found = getattr(self.unwrapped, "env_args", None)
         return found if isinstance(found, dict) else None
 
@@ -345,7 +345,7 @@ def check_vec_env(
 
 
 def known_task(env: VecEnv) -> Task | None:
-    """What Gymnasium knows of the task behind a :class:`ReturnToGoWrapper`; None of one that is not registered."""
+    """Return id and time limit of the registered task behind a :class:`ReturnToGoWrapper`, else None."""
     (task,) = env.get_attr("known_task", indices=0)
     return task
 

@@ -32,7 +32,7 @@ def register_gymnasium_robotics() -> None:
 
 
 def _object(env: gym.Env) -> tuple[str, str] | None:
-    """Where a task with the wrong reward has its object; None of another one."""
+    """Return where a task with the wrong reward has its object; None for another task."""
     name = type(env.unwrapped).__name__.removesuffix("Env")
     is_dense = not getattr(env.unwrapped, "sparse_reward", True)
     return OBJECTS.get(name) if is_dense and env.spec is not None and env.spec.version == 1 else None

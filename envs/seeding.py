@@ -1,4 +1,4 @@
-"""Whether an environment starts from its seed, which replays and comparisons rely on."""
+"""A check that an environment starts from its seed, which replays and comparisons rely on."""
 
 import copy
 import warnings

@@ -8,7 +8,7 @@ SUCCESS = ("is_success", "success")
 
 def reported_success(info: dict[str, Any]) -> bool | None:
     """
-    Whether an episode succeeded.
+    Return whether an episode succeeded.
 
     :param info: of the episode's last step
     :return: None where it says nothing

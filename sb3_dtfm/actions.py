@@ -70,7 +70,7 @@ def bounds_of(space: ActionSpace) -> tuple[np.ndarray, np.ndarray]:
 
 
 def same_actions(space: ActionSpace, other: ActionSpace) -> bool:
-    """Whether two spaces hold the same actions, of whatever precision."""
+    """Return whether two spaces hold the same actions, of whatever precision."""
     return space.shape == other.shape and all(
         np.allclose(bound, bound_of_other) for bound, bound_of_other in zip(bounds_of(space), bounds_of(other), strict=True)
     )

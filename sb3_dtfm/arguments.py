@@ -32,7 +32,7 @@ class Number(NamedTuple):
     optional: bool = False
 
     def accepts(self, value: Any) -> bool:
-        """Whether a value is such a number; True and False, NaN and infinity are none."""
+        """Return whether a value is such a number; True and False, NaN and infinity are none."""
         if value is None:
             return self.optional
         kind = numbers.Integral if self.whole else numbers.Real
@@ -64,7 +64,7 @@ class Choice(NamedTuple):
     values: tuple[Any, ...]
 
     def accepts(self, value: Any) -> bool:
-        """Whether a value is one of them; 1 is not True."""
+        """Return whether a value is one of them; 1 is not True."""
         return any(type(value) is type(one) and value == one for one in self.values)
 
     def __str__(self) -> str:
@@ -75,7 +75,7 @@ class Rule(Protocol):
     """The accepted values of an argument, as a message says them."""
 
     def accepts(self, value: Any) -> bool:
-        """Whether a value is one of them."""
+        """Return whether a value is one of them."""
         ...
 
 

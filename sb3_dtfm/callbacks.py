@@ -262,7 +262,7 @@ class FlowFigure(BaseCallback):
 
 def draw_flow(policy: Any, window: Any, seed: int = 0) -> "Figure":
     """
-    Where a flow takes noise, for the newest step of a window.
+    Draw where a flow takes noise, for the newest step of a window.
 
     :param policy: DTFM's, of actions of two numbers, one a step
     :param window: of a buffer, (1, K, ...)
@@ -293,7 +293,7 @@ def draw_flow(policy: Any, window: Any, seed: int = 0) -> "Figure":
 
 def flow_paths(head: Any, hidden: th.Tensor, noise: th.Tensor, n_points: int = 50) -> th.Tensor:
     """
-    What lies between noise and actions.
+    Return the flow's paths from noise to actions.
 
     :param head: a flow's
     :param hidden: (..., D)

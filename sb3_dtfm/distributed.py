@@ -25,7 +25,7 @@ def n_processes() -> int:
 
 
 def is_first_process() -> bool:
-    """Whether this process is the one that writes, evaluates and runs callbacks."""
+    """Return whether this process is the one that writes, evaluates and runs callbacks."""
     return not dist.is_initialized() or dist.get_rank() == 0
 
 
@@ -124,7 +124,7 @@ class DataParallel:
         return loss, weighted
 
     def _weight(self, mask: th.Tensor) -> th.Tensor:
-        """What a mean over this process's valid steps counts, so that the mean over the processes is that over all steps."""
+        """Return the weight of this process's mean over valid steps, so that the processes' mean is that over all steps."""
         return self.n_processes * mask[self._rows].sum() / mask.sum()
 
     def mean(self, values: dict[str, th.Tensor]) -> dict[str, th.Tensor]:

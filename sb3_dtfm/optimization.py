@@ -41,7 +41,7 @@ def learning_rate_factor(schedule: str, step: int, progress: float, warmup_steps
 
 
 def multiplies_bfloat16(device: th.device) -> bool:
-    """Whether the hardware has instructions for matrix products in bfloat16, which need not be faster."""
+    """Return whether the hardware has instructions for matrix products in bfloat16, which need not be faster."""
     if device.type == "cuda":
         return th.cuda.is_bf16_supported(including_emulation=False)
     return th.cpu._is_avx512_bf16_supported() or th.cpu._is_amx_tile_supported()

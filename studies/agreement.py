@@ -1,5 +1,5 @@
 """
-How near trained models' actions are to the recorded ones, and to those of the agent that was recorded, had it not drawn them
+Distances of trained models' actions from recorded ones, and from those of the recorded agent, had it not drawn them
 at random.
 
     python studies/agreement.py Walker2d-v5.zip ... --agent ppo-Walker2d-v5.zip --agent-algo ppo \\
@@ -37,7 +37,7 @@ def split(buffer: TrajectoryBuffer, fraction: float, seed: int) -> dict[str, Tra
 
 
 def window_ends(buffer: TrajectoryBuffer) -> dict[str, th.Tensor]:
-    """Where windows end: anywhere, and among the first steps of episodes."""
+    """Draw where windows end: anywhere, and among the first steps of episodes."""
     generator = th.Generator().manual_seed(0)
     first = th.nonzero(buffer.timesteps < N_FIRST_STEPS).squeeze(1)
     return {
@@ -47,7 +47,7 @@ def window_ends(buffer: TrajectoryBuffer) -> dict[str, th.Tensor]:
 
 
 def share_at_bounds(buffer: TrajectoryBuffer) -> float:
-    """Of all action dimensions at all steps, those whose action was as small or as large as it can be."""
+    """Share of all action dimensions at all steps whose action was as small or as large as it can be."""
     actions = buffer.actions.numpy()
     return float(((actions <= buffer.action_space.low) | (actions >= buffer.action_space.high)).mean())
 

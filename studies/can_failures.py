@@ -1,5 +1,5 @@
 """
-Where trained models' attempts at Can end that fail: what to look at before a cure is chosen.
+Ends of trained models' attempts at Can that fail, to be looked at before a cure is chosen.
 
     python studies/can_failures.py logs/dtfm/robosuite-Can-v0_1/robosuite-Can-v0.zip ...
 
@@ -33,7 +33,7 @@ GRIPPER = -1  # of an action, negative to open
 
 def sort(observations: np.ndarray, actions: np.ndarray, success: bool) -> str:
     """
-    What an episode came to.
+    Name what an episode came to.
 
     :param observations: (T, O)
     :param actions: (T, A)
@@ -63,7 +63,7 @@ def first_opened(observations: np.ndarray, actions: np.ndarray) -> int | None:
 
 def share_that_lets_go(policy: SequencePolicy, observation: dict[str, np.ndarray], state: tuple[np.ndarray, ...]) -> float:
     """
-    Of other draws at a decision.
+    Share of other draws at a decision that let go.
 
     :param policy: of a DTFM
     :param observation: of one row

@@ -1,5 +1,5 @@
 """
-What the critic's choice is worth on an arm by how candidates are drawn, and by whom (docs/studies/finetuning.md).
+Worth of the critic's choice on an arm by how candidates are drawn, and by whom (docs/studies/finetuning.md).
 
     python studies/candidates.py --n 16 --noise 1.5 logs/dtfm/robosuite-Can-v0_7/robosuite-Can-v0.zip ...
     python studies/candidates.py --together models --n 8 ONE.zip TWO.zip THREE.zip

@@ -1,5 +1,5 @@
 """
-How a critic's two values should choose among draws (docs/studies/random-walks.md).
+Ways in which a critic's two values may choose among draws (docs/studies/random-walks.md).
 
     python studies/choosing.py MODEL --env AdroitHandDoor-v1 --target-return 3000 --ways one gain smaller >> choosing.jsonl
 

@@ -73,7 +73,7 @@ def episodes(n_episodes: int, seed: int) -> Iterator[RecordedEpisode]:
 
 
 def act(demonstrator: Demonstrator, observations: np.ndarray, starts: np.ndarray, numbers: list[int]) -> np.ndarray:
-    """What :func:`~sb3_dtfm.recording.episodes.run_episodes` asks of who acts."""
+    """Act as :func:`~sb3_dtfm.recording.episodes.run_episodes` asks."""
     return demonstrator.act(observations[0])[None]
 
 

@@ -1,5 +1,5 @@
 """
-Which extractor locates tool and block of Push-T best after the same seconds of learning, on one core:
+Compare how well extractors locate tool and block of Push-T after the same seconds of learning, on one core:
 
     OMP_NUM_THREADS=1 PYTHONPATH=studies python studies/encoders.py pusht_cchi_v7_replay.zarr.zip
 

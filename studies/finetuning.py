@@ -1,5 +1,5 @@
 """
-What fine-tuning brought: runs of `sb3-dtfm finetune` as rows, and their curves.
+Results of fine-tuning: runs of `sb3-dtfm finetune` as rows, and their curves.
 
     python studies/finetuning.py measure logs/dtfm/robosuite-Can-v0_2 --before logs/dtfm/robosuite-Can-v0_1 \\
         --like mine/robosuite-Can-v0_0.05_dtfm_seed0_small.jsonl --label own-episodes --output mine
@@ -78,7 +78,7 @@ def measure(run: Path, before: Path, like: Row, label: str, output: Path) -> Non
 
 
 def environment_steps(run: Path) -> np.ndarray:
-    """When the episodes of a run ended, (E + 1, 2): seconds since its start, and the steps of all of them by then."""
+    """Return when the episodes of a run ended, (E + 1, 2): seconds since its start, and the steps of all of them by then."""
     ends = np.zeros((1, 2))
     for path in run.glob("*.monitor.csv"):
         columns = np.loadtxt(path, delimiter=",", skiprows=2, usecols=(2, 1), ndmin=2)
@@ -112,7 +112,7 @@ def curve(run: Path) -> list[dict[str, Any]]:
 
 def final_episodes(path: Path, envs: Any) -> dict[str, Any]:
     """
-    What a model of a run reaches from the initial states of final evaluations.
+    Return what a model of a run reaches from the initial states of final evaluations.
 
     :param path: its file, in its run's folder, which lies in that of the algorithm
     :param envs: to act in
@@ -184,12 +184,12 @@ def by_rollout_steps(folder: Path, task: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mean_steps(runs: list[Run]) -> float:
-    """Of what they learned from."""
+    """Return the mean number of steps that runs learned from."""
     return float(np.mean([run.final["data"]["n_steps"] for run in runs]))
 
 
 def new_figure(n: int = 1) -> tuple[Figure, list[Axes]]:
-    """With `n` fields side by side."""
+    """Make a figure with `n` fields side by side."""
     figure = Figure(figsize=(2.9 + 3.6 * n, 3.8), layout="constrained")
     FigureCanvasAgg(figure)
     return figure, list(figure.subplots(1, n, sharey=True, squeeze=False)[0])

@@ -39,7 +39,7 @@ WAYS = {"sac": (SAC, NoiseActionVecEnv), "ppo": (PPO, ResidualActionVecEnv)}
 
 
 def settings_of(path: Path, env_id: str) -> dict[str, Any]:
-    """Of a task, in a packaged file."""
+    """Return the settings of a task, in a packaged file."""
     settings = yaml.safe_load(path.read_text())
     return settings.get(env_id, settings["default"])
 
@@ -61,7 +61,7 @@ def make_model(env_id: str) -> DTFM:
 
 
 def make_envs(env_id: str, n_envs: int, vec_env: str) -> VecEnv:
-    """As `sb3-dtfm finetune` makes them."""
+    """Make environments as `sb3-dtfm finetune` does."""
     wrapper = functools.partial(ReturnToGoWrapper, target_return=1.0)
     return make_vec_env(env_id, n_envs, seed=0, wrapper_class=wrapper, vec_env_cls=VEC_ENVS[vec_env])
 

@@ -1,5 +1,5 @@
 """
-What the flow does: a picture of noise on its way to actions, where the data have two.
+Pictures of the flow: noise on its way to actions, where the data have two.
 
 Demonstrations go left or right, whatever is seen. DTFM and DT learn from them for some seconds.
 

@@ -1,5 +1,5 @@
 """
-What learning and acting with two cameras of 84 x 84 takes, beside the encoder's products alone. On one core:
+Time that learning and acting with two cameras of 84 x 84 takes, beside the encoder's products alone. On one core:
 
     OMP_NUM_THREADS=1 python studies/image_steps.py
 

@@ -1,5 +1,5 @@
 """
-How many gradient steps a second one process makes with a thread and with two, and two processes with a thread each.
+Gradient steps a second that one process makes with a thread and with two, and two processes with a thread each.
 
     python studies/processes.py --dataset local/halfcheetah/expert-v0
 

@@ -110,7 +110,7 @@ def read_recorded(source: str) -> Any:
 
 def simulated_overlaps(states: np.ndarray, actions: np.ndarray) -> np.ndarray:
     """
-    What the simulator rewards each recorded step with, put into the recorded state before each.
+    Return what the simulator rewards each recorded step with, put into the recorded state before each.
 
     :param states: (T, 5) of one episode
     :param actions: (T, 2)

@@ -1,5 +1,5 @@
 """
-What fine-tuning stands beside: SAC from scratch, and SAC with the recorded episodes in its replay buffer from the start.
+Baselines of fine-tuning: SAC from scratch, and SAC with the recorded episodes in its replay buffer from the start.
 
     OMP_NUM_THREADS=1 python studies/sac.py --like mine/robosuite-Can-v0_0.05_dtfm_seed0_small.jsonl -n 120000 \\
         --eval-freq 30000 --output mine [--with-data]

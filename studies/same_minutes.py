@@ -1,5 +1,5 @@
 """
-What a study's runs had reached when those of another one, which need fewer minutes, were finished: same tasks, same data.
+Results of a study's runs when those of another one, which need fewer minutes, were finished: same tasks and data.
 
     python studies/same_minutes.py results/one-token.csv results/small.csv --labels one-token ""
 
@@ -19,13 +19,13 @@ N_LAST = 3
 
 
 def runs_of(folder: Path, label: str) -> dict[tuple, list[Run]]:
-    """By task, share of the data and algorithm."""
+    """Return runs by task, share of the data and algorithm."""
     groups = [group for study in read_studies([folder]) for group in study.groups if group.label == label]
     return {key: runs for group in groups for key, runs in group.runs.items()}
 
 
 def minutes_a_step(runs: list[Run]) -> float:
-    """Of the quickest run."""
+    """Return the minutes of a step of the quickest run."""
     return min(run.minutes / run.final["step"] for run in runs)
 
 

@@ -186,7 +186,7 @@ def run_baseline(job: Job, baseline: Baseline, python: Path, log: Path) -> Train
 
 
 def kind(job: Job) -> str:
-    """What the authors of baselines change their settings by."""
+    """Kind of data, by which the authors of baselines change their settings."""
     task = job.task.env_id
     return "manipulation" if task.startswith("robosuite") else "hand" if task.startswith("AdroitHand") else "locomotion"
 
@@ -231,7 +231,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def seconds_by_algorithm(results: Path) -> dict[tuple[str, str], list[tuple[float, bool]]]:
-    """By data and algorithm, of each seed: the seconds, and whether it had reached what is enough by then."""
+    """Return by data and algorithm, for each seed, the seconds, and whether it had reached what is enough by then."""
     found: dict[tuple[str, str], list[tuple[float, bool]]] = {}
     (rows,) = read_results([results]).values()
     for last in sorted((row for row in rows if row["final"]), key=lambda row: row["seed"]):

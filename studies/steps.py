@@ -1,5 +1,5 @@
 """
-What a gradient step takes beside its matrix products alone: docs/performance.md's tables. On one core:
+Time that a gradient step takes beside its matrix products alone: docs/performance.md's tables. On one core:
 
     OMP_NUM_THREADS=1 python studies/steps.py defaults             # what the data decide, a minute
     OMP_NUM_THREADS=1 python studies/steps.py sizes                # larger and smaller ones
@@ -32,7 +32,7 @@ from sb3_dtfm.zoo.registration import policy_of
 
 class Step(NamedTuple):
     """
-    What a gradient step is of.
+    Settings of a gradient step.
 
     :param algo: "dt" or "dtfm"
     :param observation_dim: numbers of an observation

@@ -26,7 +26,7 @@ def measured(run: Run, measure: str) -> str:
 
 
 def fallen(run: Run) -> str:
-    """How many of the late and the final episodes ended early, and in brackets how many of them in their first steps."""
+    """Return how many late and final episodes ended early, and in brackets how many of them in their first steps."""
     if run.counts_success:
         return NONE
     results = [*run.evaluations[-N_LATE:], run.final]
@@ -41,7 +41,7 @@ def median_steps(run: Run) -> str:
 
 
 def milliseconds(runs: Sequence[Run]) -> str:
-    """Of an action in one environment, the mean over those runs that tell."""
+    """Milliseconds of an action in one environment, the mean over those runs that tell."""
     told = [time for run in runs if (time := run.final.get("action_ms")) is not None]
     return f"{np.mean(told):.1f}" if told else NONE
 

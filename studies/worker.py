@@ -91,21 +91,21 @@ def act(model: OfflineAlgorithm, n: int, n_envs: int, first: int) -> dict[str, f
 
 
 def operations(work: Callable[[], object]) -> dict[str, float]:
-    """What torch's operations take, in any unit."""
+    """Measure what torch's operations take, in any unit."""
     with th.profiler.profile(activities=[th.profiler.ProfilerActivity.CPU]) as recorded:
         work()
     return {event.key: event.self_cpu_time_total for event in recorded.key_averages()}
 
 
 def calls(work: Callable[[], object]) -> dict[str, float]:
-    """What functions take by themselves, those of Python and of its libraries."""
+    """Measure what functions take by themselves, those of Python and of its libraries."""
     with cProfile.Profile() as recorded:
         work()
     return {name: values[2] for (_, _, name), values in pstats.Stats(recorded).stats.items()}  # type: ignore[attr-defined]
 
 
 def shares(times: dict[str, float]) -> dict[str, float]:
-    """In percent, the largest first."""
+    """Return shares in percent, the largest first."""
     found = {name: round(100 * time / sum(times.values()), 1) for name, time in times.items()}
     return dict(sorted(found.items(), key=lambda item: -item[1])[:N_SHARES])
 

@@ -1,4 +1,4 @@
-"""How one episode's robot differs from another's, after MuJoCo Playground: a table of ranges."""
+"""Differences between one episode's robot and another's, after MuJoCo Playground: a table of ranges."""
 
 from typing import NamedTuple
 

@@ -14,7 +14,7 @@ STEEPEST = 0.5  # cosine of the trunk's tilt below which the robot has fallen
 
 class Motion(NamedTuple):
     """
-    How the robot moves at present.
+    The robot's present motion.
 
     :param velocity: of the IMU in the trunk's frame, (3,) m/s
     :param gyro: turn rates in the trunk's frame, (3,) rad/s
@@ -139,7 +139,7 @@ class Simulation:
 
     @property
     def motion(self) -> Motion:
-        """At present."""
+        """The present motion."""
         data = self.data
         mujoco.mju_quat2Mat(self._rotation, data.qpos[3:7])
         world_to_trunk = self._rotation.reshape(3, 3).T

@@ -64,7 +64,7 @@ class Cameras:
 
 
 def camera_args(names: Sequence[str], size: int) -> dict[str, Any]:
-    """How robomimic files describe cameras."""
+    """Describe cameras as robomimic files do."""
     used = {"camera_names": list(names), "camera_heights": size, "camera_widths": size} if names else {}
     return {"use_camera_obs": bool(names), "camera_depths": False, **used}
 

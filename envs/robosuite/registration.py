@@ -78,7 +78,7 @@ def differences_from_robomimic(
     env_args: str | dict[str, Any], ours: str | dict[str, Any] | None = None
 ) -> dict[str, tuple[Any, Any]]:
     """
-    How actions of a robomimic file move another arm, or the arm otherwise, than in an environment of ours.
+    Compare how actions move the arm in a robomimic file and in an environment of ours.
 
     :param env_args: as for :func:`env_id_from_robomimic`
     :param ours: `RobosuiteEnv.env_args` of the environment; by default a registered one

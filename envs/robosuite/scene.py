@@ -123,11 +123,11 @@ def scene_xml(env: Any, variation: "SceneVariation | None") -> str:
 
 
 class SceneVariation:
-    """What one episode's scene has otherwise than another's, beside the positions and velocities that a state holds."""
+    """Differences between one episode's scene and another's, beside the positions and velocities that a state holds."""
 
     def draw(self, env: Any, rng: np.random.Generator) -> None:
         """
-        Before robosuite's own reset, draw what that does not.
+        Draw what robosuite's own reset does not; it comes before that.
 
         :param env: robosuite's environment
         :param rng: source of randomness
@@ -199,7 +199,7 @@ def _named(scene: ET.Element, tag: str, name: str) -> ET.Element:
 
 
 def _numbers(values: np.ndarray | list[float]) -> str:
-    """As MuJoCo's XML has them, with all digits."""
+    """Write numbers as MuJoCo's XML has them, with all digits."""
     return " ".join(repr(float(value)) for value in values)
 
 

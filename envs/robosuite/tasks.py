@@ -16,7 +16,7 @@ from sb3_dtfm.envs.robosuite.scene import BodyPoses, CubeSize, SceneVariation, s
 
 def check_success(env: Any) -> bool:
     """
-    Whether robosuite holds the task for solved.
+    Return whether robosuite holds the task for solved.
 
     :param env: robosuite's environment
     """
@@ -25,7 +25,7 @@ def check_success(env: Any) -> bool:
 
 def wipe_and_check(env: Any) -> bool:
     """
-    Whether the table is clean.
+    Return whether the table is clean.
 
     :param env: robosuite's environment, which takes away the dirt under the wiper when it is asked for the reward
     """

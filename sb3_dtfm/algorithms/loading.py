@@ -86,7 +86,7 @@ class SavedModel(NamedTuple):
 @contextlib.contextmanager
 def wrap_file_errors(source: str) -> Iterator[None]:
     """
-    Have whatever does not fit be a fault of the file.
+    Turn errors about what does not fit into faults of the file.
 
     :raises ModelFileError: names it
     """
@@ -100,7 +100,7 @@ def wrap_file_errors(source: str) -> Iterator[None]:
 
 def parameters(policy: SequencePolicy, tensors: dict[str, dict[str, th.Tensor]], source: str) -> dict[str, Any]:
     """
-    What an algorithm's `set_parameters` takes, from the tensors of a file.
+    Return the tensors of a file in the form that an algorithm's `set_parameters` takes.
 
     :raises ModelFileError: see :func:`optimizer_state`
     """
@@ -163,7 +163,7 @@ def _policy_class(policies: Mapping[str, type[BasePolicy]], name: str, source: s
 
 
 def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
-    """What is not checked as arguments are."""
+    """Check the attributes that are not arguments."""
     if not isinstance(attributes.get("policy_kwargs", {}), dict):
         raise ModelFileError(f"{source}: policy_kwargs are {attributes['policy_kwargs']!r}, expected arguments by name.")
     extractor = attributes.get("policy_kwargs", {}).get(EXTRACTOR_KWARGS)
@@ -226,7 +226,7 @@ def _to_means(saved: dict[str, Any], source: str) -> RunningMeans:
 
 def optimizer_state(optimizer: th.optim.Optimizer, tensors: Mapping[str, th.Tensor], source: str) -> dict[str, Any]:
     """
-    What `load_state_dict` takes. What applies to all weights, as their decay, is the optimiser's own.
+    Return the state that `load_state_dict` takes. Settings of all weights, such as their decay, are the optimiser's own.
 
     :param optimizer: of the model that is loaded
     :param tensors: its own of the file

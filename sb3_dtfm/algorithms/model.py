@@ -361,7 +361,7 @@ class SequenceModel(BaseAlgorithm):
         device: th.device | str = "auto",
     ) -> None:
         """
-        SB3's, from a file as :meth:`save` makes them.
+        Set parameters as SB3 does, from a file as :meth:`save` makes them.
 
         :param load_path_or_dict: the file, or what `get_parameters` gives
         :param exact_match: all parameters have to be there, and no others

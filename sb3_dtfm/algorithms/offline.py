@@ -478,7 +478,7 @@ class OfflineAlgorithm(SequenceModel):
         check_finite(means, lambda: self._name_steps(n_steps), self._last_saved)
 
     def _name_steps(self, n_steps: int) -> str:
-        """Which gradient steps the newest ones are; of a single one, the episodes of its batch, too."""
+        """Return which gradient steps the newest ones are, for a single one also the episodes of its batch."""
         if n_steps > 1:
             return f"between gradient steps {self._n_updates - n_steps + 1} and {self._n_updates} of this model"
         assert self.buffer is not None

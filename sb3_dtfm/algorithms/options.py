@@ -18,7 +18,7 @@ from sb3_dtfm.optimization import LEARNING_RATE_SCHEDULES, PRECISIONS
 @dataclass(frozen=True)
 class TrainingOptions(Options):
     """
-    Which windows are drawn of the data, and how a gradient step learns from them.
+    Options of the windows that are drawn, and of the gradient steps that learn from them.
 
     :param batch_size: windows in a gradient step, of all processes together; by default 64 of less than 10,000 recorded
         steps, and 256 of more

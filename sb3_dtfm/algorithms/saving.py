@@ -127,7 +127,7 @@ def _means(means: RunningMeans) -> dict[str, Any]:
 
 
 def optimizers(policy: SequencePolicy) -> dict[str, tuple[th.optim.Optimizer, str]]:
-    """By the name that SB3 finds them by, each with how the names of its tensors begin in a file."""
+    """Return the optimisers by SB3's names, each with the prefix of its tensors' names in a file."""
     own: dict[str, tuple[th.optim.Optimizer, str]] = {OPTIMIZER: (policy.optimizer, "")}
     return own if policy.critic is None else {**own, CRITIC_OPTIMIZER: (policy.critic.optimizer, CRITIC_PREFIX)}
 

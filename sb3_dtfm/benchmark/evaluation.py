@@ -32,7 +32,7 @@ N_RANDOM_EPISODES = 10  # whose mean return scores 0
 
 class Episodes(NamedTuple):
     """
-    What n episodes came to, in the order of their seeds.
+    Results of n episodes, in the order of their seeds.
 
     :param returns: in environment reward units
     :param lengths: in environment steps
@@ -216,7 +216,7 @@ class EvaluationCallback(BaseCallback):
             self._take_up_rows()
 
     def _take_up_rows(self) -> None:
-        """Those of an interrupted run up to its checkpoint; steps behind the last row took as long as those before it."""
+        """Keep an interrupted run's rows up to its checkpoint; steps behind the last row took as long as those before it."""
         rows = [row for row in read_rows(self.rows, torn_end=True) if row["step"] <= self.num_timesteps]
         with replacing(self.rows) as beside:
             for row in rows:

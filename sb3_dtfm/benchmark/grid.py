@@ -185,7 +185,7 @@ def plan(options: argparse.Namespace) -> tuple[list[Job], list[RunKey]]:
 
 def _settings(task: Task, regime: float, options: argparse.Namespace) -> dict[str, dict[str, Any]]:
     """
-    By algorithm, of those asked for that can learn the task.
+    Return settings by algorithm, for those asked for that can learn the task.
 
     :raises UsageError: settings that do not fit, or that differ by more than a head
     """

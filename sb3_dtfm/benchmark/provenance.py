@@ -93,7 +93,7 @@ def read_data(env_id: str, settings: dict[str, Any]) -> TrajectoryBuffer:
 
 def describe_data(buffer: TrajectoryBuffer, dataset: str, recorded_from: str | None = None) -> dict[str, Any]:
     """
-    What a dataset was recorded from, and how good that was: the scale of normalised scores.
+    Describe what a dataset was recorded from, and how good that was: the scale of normalised scores.
 
     :param buffer: its episodes
     :param dataset: Minari id, robomimic file or flat arrays

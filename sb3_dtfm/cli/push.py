@@ -82,7 +82,7 @@ def evaluate(model: FoundModel, agent: AgentFiles, options: argparse.Namespace) 
 
 
 def _write_video(path: Path, model: FoundModel, options: argparse.Namespace) -> bool:
-    """Whether this machine can."""
+    """Return whether this machine can."""
     arguments = [
         "--algo",
         options.algo,

@@ -196,7 +196,7 @@ def distinguished(paths: Sequence[str]) -> list[str]:
 
 
 def _n_alike(sequences: Sequence[Sequence[str]]) -> int:
-    """How many elements all of them begin with."""
+    """Return how many elements all sequences begin with."""
     return sum(1 for _ in itertools.takewhile(lambda place: len(set(place)) == 1, zip(*sequences, strict=False)))
 
 
@@ -225,7 +225,7 @@ def _summary(reached: Reached) -> str:
 
 def finding(reached: Sequence[Reached]) -> str:
     """
-    Whether the target return has an effect, and the best one.
+    Say whether the target return has an effect, and which is the best one.
 
     :param reached: for each of two or more returns, as many episodes
     :return: a sentence

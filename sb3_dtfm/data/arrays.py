@@ -54,7 +54,7 @@ class Arrays(ABC):
         """A whole array of numbers."""
 
     def has(self, names: Sequence[str]) -> bool:
-        """Whether there is one of these."""
+        """Return whether there is one of these."""
         return any(name in self.names for name in names)
 
     def name(self, names: Sequence[str]) -> str:
@@ -100,7 +100,7 @@ class Arrays(ABC):
 
 
 class _Npz(Arrays):
-    """Of an opened archive."""
+    """Arrays of an opened `.npz` archive."""
 
     def __init__(self, archive: zipfile.ZipFile, source: str) -> None:
         self._archive = archive
@@ -145,7 +145,7 @@ class _Npz(Arrays):
 
 
 class _Hdf5(Arrays):
-    """Of an opened file, at its top."""
+    """Arrays at the top of an opened hdf5 file."""
 
     def __init__(self, file: h5py.File, source: str) -> None:
         check_within(file, "infos", source)
@@ -159,7 +159,7 @@ class _Hdf5(Arrays):
 
 
 class _InMemory(Arrays):
-    """Of anyone's own; observations may be a dictionary of arrays."""
+    """Arrays in memory; observations may be a dictionary of arrays."""
 
     def __init__(self, arrays: Mapping[str, Any]) -> None:
         super().__init__("arrays", arrays)
@@ -178,7 +178,7 @@ class _InMemory(Arrays):
 
 
 class _Table(Arrays):
-    """Of a DataFrame's columns, whose entries are numbers, or arrays of one length."""
+    """A DataFrame's columns, whose entries are numbers, or arrays of one length."""
 
     are_columns = True
 
@@ -196,7 +196,7 @@ class _Table(Arrays):
 
 
 class _Parquet(Arrays):
-    """Of an opened Parquet file."""
+    """Columns of an opened Parquet file."""
 
     are_columns = True
 
@@ -217,7 +217,7 @@ class _Parquet(Arrays):
 
 
 def is_table(dataset: Any) -> bool:
-    """Whether this is a DataFrame, of pandas or of another package."""
+    """Return whether this is a DataFrame, of pandas or of another package."""
     return hasattr(dataset, "columns") and hasattr(dataset, "to_numpy") and hasattr(dataset, "__getitem__")
 
 
@@ -249,7 +249,7 @@ def _parsed(column: Sequence[str]) -> np.ndarray:
 @contextlib.contextmanager
 def opened(dataset: Any) -> Iterator[Arrays]:
     """
-    While they are read.
+    Open arrays while they are read.
 
     :param dataset: path of the file, arrays by name, or a DataFrame
     :raises DatasetError: no such file, or a damaged one

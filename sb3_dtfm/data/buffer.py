@@ -136,7 +136,7 @@ class TrajectoryBuffer(FlatSteps):
 
     @property
     def n_dropped(self) -> int:
-        """How many episodes `on_invalid="drop"` has left out."""
+        """Number of episodes that `on_invalid="drop"` has left out."""
         return self.dropped[0] if self.dropped else 0
 
     @property

@@ -98,7 +98,7 @@ class Fingerprint(NamedTuple):
     @classmethod
     def of(cls, name: str, path: Path, arguments: Any) -> "Fingerprint":
         """
-        That of a dataset as it is now.
+        Take the fingerprint of a dataset as it is now.
 
         :param name: what it is called, for its cache's folder and messages
         :param path: its file, or the folder that holds its files

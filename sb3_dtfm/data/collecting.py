@@ -127,7 +127,7 @@ def _checked(
 
 
 def _table_of_one(trajectory: Trajectory, start: int, to_go: np.ndarray) -> EpisodeTable:
-    """Of a single episode."""
+    """Make the table of a single episode."""
     row = (
         start,
         len(trajectory),

@@ -111,7 +111,7 @@ def _dropout(buffer: TrajectoryBuffer) -> Decision:
 
 def _by_return(errors: PredictionErrors | None) -> list[Decision]:
     """
-    Whether a return-to-go is seen, and better episodes are learned from more often.
+    Decide whether a return-to-go is seen, and better episodes are learned from more often.
 
     Episodes of a single agent differ by their starts and their noise: a target return of the best ones does harm, and so
     does learning from these more often. Over 34 data sets the measure was 4.2 or more where agents of several strengths,
@@ -129,7 +129,7 @@ def _by_return(errors: PredictionErrors | None) -> list[Decision]:
 
 def _by_reward(buffer: TrajectoryBuffer) -> list[Decision]:
     """
-    Whether returns to go are those to be expected from an observation, instead of the recorded ones.
+    Decide whether returns to go are those to be expected from an observation, instead of the recorded ones.
 
     With returns expected after 50 steps three mediocre cheetahs with noise return 4,760 and 4,383 (two seeds) instead of
     4,237, both with a bounded return-to-go. Where a reward only tells of success, success may be expected from everywhere: a

@@ -12,7 +12,7 @@ from sb3_dtfm.windows import OBSERVATION, Windows
 
 
 def channels_first(images: th.Tensor) -> th.Tensor:
-    """From (R, height, width, channels), or channels first, to (R, channels, height, width): another view of the numbers."""
+    """Bring (R, height, width, channels), or channels first, to (R, channels, height, width): a view of the same numbers."""
     return images if images.shape[1] == min(images.shape[1:]) else images.movedim(3, 1)
 
 
@@ -54,7 +54,7 @@ class FlatSteps:
 
     @property
     def memory_mapped(self) -> bool:
-        """Whether the flat tensors are files that are read where they are used."""
+        """Return whether the flat tensors are files that are read where they are used."""
         return len(self._maps) > 0
 
     @property
@@ -214,7 +214,7 @@ class FlatSteps:
         return {camera: channels_first(image).unflatten(0, tuple(shape)) for camera, image in found.items()}
 
     def _locate(self, positions: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        """Of positions among the buffer's own steps: rows in the flat tensors, time steps, and steps left in the episode."""
+        """Return rows in the flat tensors, time steps and steps left in the episode, for positions among own steps."""
         episodes = th.searchsorted(self._stops, positions, right=True)
         timesteps = positions - self._firsts[episodes]
         return self._starts[episodes] + timesteps, timesteps, self._stops[episodes] - 1 - positions

@@ -44,7 +44,7 @@ NOT_NEEDED = ("next_observations", "next_obs", "info", "infos", "metadata")
 
 def warn_of_made_up_rewards(names: Iterable[str], source: str) -> None:
     """
-    Where there are no rewards, say what counts instead, and what may have been meant by them, or by an end.
+    Say what counts where there are no rewards, and which arrays may have been meant as rewards, or as ends.
 
     :param names: of all arrays
     :param source: for the message
@@ -66,7 +66,7 @@ def warn_of_made_up_rewards(names: Iterable[str], source: str) -> None:
 
 
 def is_flat_file(dataset: Any) -> bool:
-    """Whether this is the path of such a file, by its name; of an hdf5 file, by the actions that lie at its top."""
+    """Return whether this is the path of such a file, by its name, or by actions at the top of an hdf5 file."""
     if not isinstance(dataset, str | os.PathLike):
         return False
     if os.fspath(dataset).endswith((NPZ_SUFFIX, CSV_SUFFIX, PARQUET_SUFFIX)):
@@ -80,13 +80,13 @@ def is_flat_file(dataset: Any) -> bool:
 
 
 def is_mapping(dataset: Any) -> bool:
-    """Whether these are arrays by their names."""
+    """Return whether these are arrays by their names."""
     return isinstance(dataset, Mapping)
 
 
 def fingerprint_flat_file(path: str | os.PathLike[str], options: dict[str, Any]) -> Fingerprint:
     """
-    Of a file as it is now.
+    Take the fingerprint of a file as it is now.
 
     :param path: the file
     :param options: of :func:`load_flat`
@@ -171,7 +171,7 @@ def load_flat(
 
 class _Ends(NamedTuple):
     """
-    Of the episodes.
+    Ends of the episodes.
 
     :param stops: (E,) int64, ascending: steps of the file at which each has ended, the last one N
     :param terminated: (N,) bool
@@ -211,7 +211,7 @@ def _read(
     actions = fitted(actions, space, clip_actions)
 
     def steps(first: int, end: int) -> Trajectory:
-        """Those of some episodes, one after the other."""
+        """Return the steps of some episodes, one after the other."""
         start, stop = stops[first - 1] if first else 0, stops[end - 1]
         return Trajectory(
             observations=observation.vectors[start:stop],
@@ -259,7 +259,7 @@ def _actions(arrays: Arrays, keys: Sequence[str], space: ActionSpace | None) -> 
 
 
 def _observations(arrays: Arrays, keys: Sequence[str], n_steps: int, space: spaces.Space | None) -> Observed:
-    """Of arrays, or of entries of dictionary observations."""
+    """Read observations from arrays, or from entries of dictionary observations."""
     if arrays.has(OBSERVATIONS) and not all(key in arrays.names for key in keys):
         name = arrays.name(OBSERVATIONS)
         parts = {name: observed(arrays.stored(name), keys, space, f"{arrays.source}: {name}")}
@@ -282,7 +282,7 @@ def _observations(arrays: Arrays, keys: Sequence[str], n_steps: int, space: spac
 
 
 def _ends(arrays: Arrays, n_steps: int, max_episode_steps: int | None) -> _Ends:
-    """Where episodes end, and how."""
+    """Return where episodes end, and how."""
     terminated, truncated, done = (_flags(arrays, names, n_steps) for names in (TERMINATIONS, TRUNCATIONS, DONES))
     terminated |= done & ~truncated
     stops = _told(arrays, n_steps)
@@ -365,7 +365,7 @@ def _told(arrays: Arrays, n_steps: int) -> np.ndarray | None:
 
 
 def _numbered(arrays: Arrays, n_steps: int) -> np.ndarray:
-    """As :func:`_told`, from the number or name of each step's episode."""
+    """Return what :func:`_told` does, from the number or name of each step's episode."""
     name = arrays.name(EPISODES)
     numbers = np.asarray(arrays.stored(name)).reshape(-1)
     if numbers.shape != (n_steps,):
@@ -382,7 +382,7 @@ def _numbered(arrays: Arrays, n_steps: int) -> np.ndarray:
 
 
 def _told_stops(arrays: Arrays, name: str, n_steps: int) -> np.ndarray:
-    """As :func:`_stops`, from the array of this name."""
+    """Return what :func:`_stops` does, from the array of this name."""
     array = arrays.read((name,))
     with np.errstate(invalid="ignore"):
         numbers = array.reshape(-1).astype(np.int64)

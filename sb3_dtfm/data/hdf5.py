@@ -140,7 +140,7 @@ def _check_deflated(data: h5py.h5d.DatasetID, info: h5py.h5d.StoreInfo, number: 
 
 
 def _stored_within(data: h5py.h5d.DatasetID) -> bool:
-    """Whether the numbers lie in the file that describes them; to ask a virtual array for its shape opens other files."""
+    """Return whether the numbers lie in the file that describes them; a virtual array's shape would open other files."""
     if data.get_offset() is not None:
         return True
     layout = data.get_create_plist()

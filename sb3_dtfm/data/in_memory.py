@@ -44,17 +44,17 @@ PARTS = (REWARDS, ACTIONS, OBSERVATIONS)
 
 
 def is_episodes(dataset: Any) -> bool:
-    """Whether this is a list, or another sequence, of episodes."""
+    """Return whether this is a list, or another sequence, of episodes."""
     return isinstance(dataset, Sequence) and not isinstance(dataset, str | bytes | os.PathLike)
 
 
 def is_steps(dataset: Any) -> bool:
-    """Whether this is a list of steps, of one or of several episodes."""
+    """Return whether this is a list of steps, of one or of several episodes."""
     return is_episodes(dataset) and len(dataset) > 0 and _is_step(dataset[0])
 
 
 def _is_step(found: Any) -> bool:
-    """Whether this is one step, by its reward, a number; without a reward, by an action and an observation of one step."""
+    """Return whether this is one step: its reward is a number, or without a reward its action and observation are single."""
     if isinstance(found, Mapping):
         given = (next((_n_axes(found[name]) for name in names if name in found), None) for names in PARTS)
         reward, action, observation = given
@@ -66,7 +66,7 @@ def _is_step(found: Any) -> bool:
 
 
 def _n_axes(found: Any) -> int:
-    """Of an array, or of nested lists; of lists of different lengths, those of a whole episode."""
+    """Count the axes of an array or of nested lists; lists of different lengths count as a whole episode."""
     try:
         return np.ndim(found)
     except ValueError:
@@ -74,7 +74,7 @@ def _n_axes(found: Any) -> int:
 
 
 def _parts(step: Sequence[Any]) -> list[Any]:
-    """What a step begins with, without its info, and without what comes after the flags."""
+    """Return what a step begins with, without its info, and without what comes after the flags."""
     n_first = len(SHORT_STEP)
     return [*step[:n_first], *(part for part in step[n_first:] if not isinstance(part, Mapping))][: len(STEP)]
 
@@ -298,7 +298,7 @@ def _of_arrays(
 
 
 def _success(arrays: Mapping[str, Any], n_steps: int, where: str) -> bool | None:
-    """What an episode's arrays say of its last step, or of the episode."""
+    """Return what an episode's arrays say of its success."""
     name = next((key for key in SUCCESSES if arrays.get(key) is not None), None)
     if name is None:
         return None
@@ -309,13 +309,13 @@ def _success(arrays: Mapping[str, Any], n_steps: int, where: str) -> bool | None
 
 
 def is_replay_buffer(dataset: Any) -> bool:
-    """Whether this is one of SB3's replay buffers, `DictReplayBuffer` and the like included."""
+    """Return whether this is one of SB3's replay buffers, `DictReplayBuffer` and the like included."""
     return isinstance(dataset, ReplayBuffer)
 
 
 def _breaks(replay_buffer: ReplayBuffer, order: np.ndarray) -> np.ndarray:
     """
-    Where another step follows than the next one: a second `learn()` begins with a reset, which no flag tells of.
+    Find breaks between steps: a second `learn()` begins with a reset, which no flag tells of.
 
     :param order: (T,) of the buffer's rows
     :return: (T - 1, environments) bool

@@ -29,7 +29,7 @@ START_WIDTH, START_NOISE = 2.0, 0.3
 
 
 class Range(NamedTuple):
-    """Of each dimension (D,): smallest and largest number, mean and standard deviation."""
+    """Smallest and largest number, mean and standard deviation of each dimension (D,)."""
 
     low: np.ndarray
     high: np.ndarray
@@ -72,7 +72,7 @@ def inspect_buffer(buffer: TrajectoryBuffer) -> Inspection:
 
 
 def images_alone(buffer: TrajectoryBuffer) -> bool:
-    """Whether there are no numbers beside images, but for one that is always 0."""
+    """Return whether there are no numbers beside images, but for one that is always 0."""
     return bool(buffer.image_spaces) and not buffer.own("observations").any()
 
 

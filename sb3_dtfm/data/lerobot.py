@@ -26,13 +26,13 @@ NUMBERS = ("float32", "float64", "float16", "int64", "int32", "bool")
 
 
 def is_lerobot(dataset: Any) -> bool:
-    """Whether this is the path of such a folder."""
+    """Return whether this is the path of such a folder."""
     return isinstance(dataset, str | os.PathLike) and (Path(dataset).expanduser() / INFO).is_file()
 
 
 def fingerprint_lerobot(path: str | os.PathLike[str], options: dict[str, Any]) -> Fingerprint:
     """
-    Of a folder as it is now.
+    Take the fingerprint of a folder as it is now.
 
     :param path: the folder
     :param options: of :func:`load_lerobot`
@@ -138,7 +138,7 @@ def load_lerobot(
 
 
 def _info(folder: Path, source: str) -> dict[str, Any]:
-    """What the dataset says of itself, so far as that is needed."""
+    """Read what the dataset says of itself, so far as that is needed."""
     with wrap_dataset_errors(f"{source}: {INFO}"):
         (path,) = (path for path in files_below(folder, "meta") if path == folder / INFO)
         info: dict[str, Any] = json.loads(path.read_text())

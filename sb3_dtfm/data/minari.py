@@ -59,7 +59,7 @@ MOST_ENTRIES = 2**20
 
 
 def is_minari(dataset: Any) -> bool:
-    """Whether this is an opened Minari dataset or an id of one."""
+    """Return whether this is an opened Minari dataset or an id of one."""
     if not isinstance(dataset, str):
         return isinstance(dataset, minari.MinariDataset)
     try:
@@ -71,7 +71,7 @@ def is_minari(dataset: Any) -> bool:
 
 def fingerprint_minari(dataset: str | minari.MinariDataset, options: dict[str, Any]) -> Fingerprint:
     """
-    Of a dataset as it is now, downloaded if necessary, and of its choice of episodes.
+    Take the fingerprint of a dataset as it is now, downloaded if necessary, and of its choice of episodes.
 
     :param dataset: as for :func:`load_minari`
     :param options: of :func:`load_minari`
@@ -193,7 +193,7 @@ def _reach_hub() -> None:
 
 def read_metadata(folder: Path, dataset_id: str) -> dict[str, Any]:
     """
-    What a dataset says of itself, checked before anybody acts on it.
+    Read what a dataset says of itself, checked before anybody acts on it.
 
     Minari takes memory for as many episodes and entries as are named, and where a space is missing it builds the
     environment of `env_spec`: it then imports and calls whatever stands there.
@@ -240,7 +240,7 @@ def _check_fields(metadata: dict[str, Any], source: str) -> None:
 
 
 def _n_entries(space: dict[str, Any]) -> int:
-    """How many numbers a space's entries flatten to, before it is built."""
+    """Return how many numbers a space's entries flatten to, before it is built."""
     if space["type"] in ("Dict", "Tuple"):
         parts = space["subspaces"]
         return sum(map(_n_entries, parts.values() if isinstance(parts, dict) else parts))
@@ -249,7 +249,7 @@ def _n_entries(space: dict[str, Any]) -> int:
 
 
 def _n_episodes(folder: Path, data_format: str, dataset_id: str) -> int:
-    """How many episodes are there, whatever the metadata say."""
+    """Return how many episodes there are, whatever the metadata say."""
     data = folder / HDF5_FILE_NAME if data_format == "hdf5" else folder
     with wrap_dataset_errors(f"Minari dataset {dataset_id} ({data})"):
         if data_format != "hdf5":

@@ -38,7 +38,7 @@ class Observed(NamedTuple):
     images: dict[str, np.ndarray]
 
     def first(self, n_steps: int) -> "Observed":
-        """Without what was observed after so many steps."""
+        """Return what was observed in the first steps."""
         return Observed(self.vectors[:n_steps], {camera: images[:n_steps] for camera, images in self.images.items()})
 
 
@@ -69,7 +69,7 @@ def observed(observations: Any, keys: Sequence[str] | None, space: spaces.Space 
 
 
 def is_images(array: Any) -> bool:
-    """Whether this is an image a step: bytes with three axes each."""
+    """Return whether this is an image a step: bytes with three axes each."""
     return not isinstance(array, Mapping) and np.asarray(array).dtype == np.uint8 and np.ndim(array) == 4
 
 
@@ -152,7 +152,7 @@ def part_of(space: spaces.Space | None, key: str) -> spaces.Space | None:
 
 class Chosen(NamedTuple):
     """
-    What is observed of a dataset's own space.
+    A choice of what is observed of a dataset's own space.
 
     :param cameras: the spaces of its images, by camera
     :param keys: of the other entries of a Dict, in this order; None for all
@@ -173,7 +173,7 @@ class Chosen(NamedTuple):
 
 def chosen_space(space: spaces.Space, keys: Sequence[str] | None, source: str) -> Chosen:
     """
-    What is left of a dataset's observation space.
+    Return what is left of a dataset's observation space.
 
     :param space: of the dataset
     :param keys: of a Dict's entries, cameras too, in this order; None for all of the space
@@ -199,7 +199,7 @@ def chosen_space(space: spaces.Space, keys: Sequence[str] | None, source: str) -
 
 def flatten_chosen(read: ReadArray, chosen: Chosen, where: str) -> list[np.ndarray]:
     """
-    As :func:`flatten_observations`, of the vectors that were chosen.
+    Flatten the chosen vectors, as :func:`flatten_observations` does.
 
     :param chosen: of the dataset's space
     """

@@ -18,7 +18,7 @@ SUFFIXES = (".pkl", ".pickle")
 
 def unpickled(dataset: Any, allow_pickle: bool) -> Any:
     """
-    What a pickle holds, and episodes of different lengths in arrays of objects as a list of episodes.
+    Return what a pickle holds, and episodes of different lengths in arrays of objects as a list of episodes.
 
     :param dataset: as for :func:`~sb3_dtfm.data.load_dataset`; what is no pickle stays as it is
     :param allow_pickle: read pickles

@@ -1,4 +1,4 @@
-"""How well actions are predicted by the observation, by the previous action, and by the observation and the return."""
+"""Measures of how well actions are predicted by observation, by previous action, and by observation and return."""
 
 from typing import NamedTuple
 
@@ -31,7 +31,7 @@ class PredictionErrors(NamedTuple):
 
     def plan_ratio(self) -> float:
         """
-        How much better the previous action predicts an action than the observation does.
+        Return how much better the previous action predicts an action than the observation does.
 
         People and scripts follow plans that an observation does not show: repeating the last action is the better guess.
         Agents of reinforcement learning compute each action from the observation: a regression is the better guess. Chunks
@@ -40,7 +40,7 @@ class PredictionErrors(NamedTuple):
         return float(self.by_observation.mean() / max(self.by_previous.mean(), 1e-12))
 
     def gain_by_return(self) -> float:
-        """How much better actions are predicted where the episode's return is known, in standard errors over episodes."""
+        """Return how much better actions are predicted with a known return, in standard errors over episodes."""
         gains = self.by_observation - self.by_return
         error = gains.std(ddof=1) / len(gains) ** 0.5 if len(gains) > 1 else 0.0
         return float(gains.mean() / error) if error > 0 else 0.0
@@ -48,7 +48,7 @@ class PredictionErrors(NamedTuple):
 
 def correlation_of_changes(buffer: TrajectoryBuffer) -> float:
     """
-    How an action's change from one step to the next correlates with the change before.
+    Return how an action's change from one step to the next correlates with the change before.
 
     White noise on actions takes back in one step what it did in the last: -0.5 of noise alone, 0 of a script that jumps, and
     above 0 of a smooth course.

@@ -53,7 +53,7 @@ ACCEPTED: dict[str, Rule] = {
 
 class Reader(NamedTuple):
     """
-    How datasets of one kind are read.
+    A reader of datasets of one kind.
 
     :param kind: what they are, for messages
     :param accepts: whether something is one of them
@@ -68,7 +68,7 @@ class Reader(NamedTuple):
 
 
 def is_several(dataset: Any) -> bool:
-    """Whether this is a list of datasets, and not of episodes."""
+    """Return whether this is a list of datasets, and not of episodes."""
     return is_episodes(dataset) and len(dataset) > 0 and all(_is_one_of_several(each) for each in dataset)
 
 

@@ -29,7 +29,7 @@ OLD_LAYOUT_TOLERANCE = 1e-3  # metres
 
 
 def is_robomimic(dataset: Any) -> bool:
-    """Whether this is the path of a file: one that exists, or a name that nothing else would have."""
+    """Return whether this is the path of a file: one that exists, or a name that nothing else would have."""
     if not isinstance(dataset, str):
         return isinstance(dataset, os.PathLike)
     looks_like_a_path = dataset.startswith((".", "~", os.sep)) or dataset.endswith(HDF5_SUFFIXES)
@@ -38,7 +38,7 @@ def is_robomimic(dataset: Any) -> bool:
 
 def fingerprint_robomimic(path: str | os.PathLike[str], options: dict[str, Any]) -> Fingerprint:
     """
-    Of a file as it is now.
+    Take the fingerprint of a file as it is now.
 
     :param path: the file
     :param options: of :func:`load_robomimic`
@@ -54,7 +54,7 @@ def fingerprint_robomimic(path: str | os.PathLike[str], options: dict[str, Any])
 
 @contextlib.contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[h5py.File, str]]:
-    """While it is read, and what it is called."""
+    """Open a file while it is read, and return its name, too."""
     path = existing_file(path, EXPECTED)
     if not h5py.is_hdf5(path):
         raise DatasetError(f"{path}: not an hdf5 file; a robomimic hdf5 file is expected.")
@@ -105,7 +105,7 @@ def load_robomimic(
 
 
 class _Labels(NamedTuple):
-    """Of one demonstration of T steps: rewards and dones, (T,) each, None where the file has none."""
+    """Rewards and dones of one demonstration of T steps, (T,) each, None where the file has none."""
 
     rewards: np.ndarray | None
     dones: np.ndarray | None

@@ -63,7 +63,7 @@ class ShortEpisodes(NamedTuple):
 
 def blocks(stops: np.ndarray) -> Iterator[tuple[int, int]]:
     """
-    Which episodes to read together: short ones that lie side by side, and each long one by itself.
+    Choose which episodes to read together: short ones that lie side by side, and each long one by itself.
 
     :param stops: (E,) int64, the step after each episode's last one
     :return: first episode, and the one after the last

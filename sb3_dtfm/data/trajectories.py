@@ -36,7 +36,7 @@ class ActionRangeError(DatasetError):
 @contextlib.contextmanager
 def wrap_dataset_errors(where: str, why: str = "the file is damaged or incomplete, or cut off") -> Iterator[None]:
     """
-    Whatever the libraries that read a file raise over it becomes our own error, which says where.
+    Turn whatever the libraries that read a file raise into our own error, which says where.
 
     :param where: the file, and the episode or field that is read
     :param why: what is the matter then
@@ -80,7 +80,7 @@ def check_size(n_bytes: int, n_stored: int, where: str) -> None:
 
 def check_flags(flags: np.ndarray, n_steps: int, where: str) -> np.ndarray:
     """
-    What is marked at each step.
+    Return what is marked at each step.
 
     :param flags: (T,) or (T, 1), zeros and ones of any type
     :param n_steps: T
@@ -194,7 +194,7 @@ class ReturnReference(NamedTuple):
 
 
 def _exceeds(target_return: float, recorded: float) -> bool:
-    """Whether a target is above a recorded return by more than the rounding of suggested targets to four digits."""
+    """Return whether a target is above a recorded return by more than the rounding of suggested targets to four digits."""
     return target_return > recorded and not math.isclose(target_return, recorded, rel_tol=1e-3)
 
 

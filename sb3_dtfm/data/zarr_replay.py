@@ -42,13 +42,13 @@ COLUMNS = re.compile(r"(.+)\[(\d*):(\d*)\]")
 
 
 def is_zarr(dataset: Any) -> bool:
-    """Whether this is such a path, by its name."""
+    """Return whether this is such a path, by its name."""
     return isinstance(dataset, str | os.PathLike) and os.fspath(dataset).rstrip("/").endswith(SUFFIXES)
 
 
 def fingerprint_zarr(path: str | os.PathLike[str], options: dict[str, Any]) -> Fingerprint:
     """
-    Of the folder or zip as it is now.
+    Take the fingerprint of the folder or zip as it is now.
 
     :param path: the folder or zip
     :param options: of :func:`load_zarr`

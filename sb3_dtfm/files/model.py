@@ -118,7 +118,7 @@ def read_configuration(path: Any) -> dict[str, Any]:
 
 
 def holds_pickles(path: Any) -> bool:
-    """Whether this is a model as Stable-Baselines3 itself saves them: loading its `data` runs what they hold."""
+    """Return whether this is a model as Stable-Baselines3 itself saves them: loading its `data` runs what they hold."""
     with _opened(path) as (file, name), _archive(file, name) as archive:
         names = archive.namelist()
     return CONFIGURATION not in names and "data" in names

@@ -78,7 +78,7 @@ def _graph(module: nn.Module, inputs: dict[str, Any], outputs: list[str]) -> Any
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Without what the exporter says of packages that are not installed, and of its own ways."""
+    """Silence what the exporter says of packages that are not installed, and of its own ways."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)

@@ -60,7 +60,7 @@ def hidden_name(name: str) -> str:
 
 def find_leftovers(folder: Path) -> list[Path]:
     """
-    What processes of this machine were writing when they were killed.
+    Find what processes of this machine were writing when they were killed.
 
     :param folder: where files are replaced
     """

@@ -53,7 +53,7 @@ class FinetunedPolicy(DTFMPolicy):
 
     def save(self, path: str) -> None:
         """
-        SB3's: the policy alone.
+        Save the policy alone, as SB3 does.
 
         :param path: file to write
         :raises ValueError: it is fine-tuned, which only the model's own file can hold

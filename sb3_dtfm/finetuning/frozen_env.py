@@ -74,7 +74,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
 
     @staticmethod
     def _n_shown(policy: SequencePolicy) -> int:
-        """How many numbers are shown, but for the hidden state."""
+        """Return how many numbers are shown, but for the hidden state."""
         return policy.observation_dim + 2
 
     def _act(self, context: Context, hidden: th.Tensor, actions: np.ndarray) -> tuple[np.ndarray, Context]:

@@ -94,11 +94,11 @@ class OnlineDTFM(DTFM):
         vars(self).update(check_arguments(vars(self), ACCEPTED))
 
     def _excluded_save_params(self) -> list[str]:
-        """Also what is kept in a file of its own, or belongs to the environments."""
+        """Add what is kept in a file of its own, or belongs to the environments."""
         return [*super()._excluded_save_params(), "replay_buffer", "_running", "_began", "_state"]
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        """SB3's own, for the environments count here."""
+        """Set up as SB3 does, since the environments' steps count here."""
         self._check_arguments(learning_rate=POSITIVE)
         before = self._last_obs
         self._training_seconds, self._timed_steps = 0.0, 0
@@ -289,13 +289,13 @@ class OnlineDTFM(DTFM):
         return (joined(batches) for batches in zip(*streams, strict=True))
 
     def _n_own(self, own: TrajectoryBuffer, batch_size: int) -> int:
-        """How many of a batch are from own episodes, so that their steps count as much as the dataset's."""
+        """Return how many of a batch are from own episodes, so that their steps count as much as the dataset's."""
         assert self.buffer is not None
         share = len(own) / (len(own) + len(self.buffer))
         return max(round(share * batch_size), 1)
 
     def _sample_transitions(self, batch_size: int, generator: th.Generator) -> Transitions:
-        """Of all episodes, so many own ones as are imitated."""
+        """Draw steps of all episodes, as many of own ones as are imitated."""
         if self.replay_buffer is None:
             return super()._sample_transitions(batch_size, generator)
         n_own = self._n_own(self.replay_buffer, batch_size)

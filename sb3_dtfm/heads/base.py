@@ -14,7 +14,7 @@ NOISE_ROWS = 1024
 
 class ActionHead(nn.Module, ABC):
     """
-    From hidden states to actions in [-1, 1].
+    A map from hidden states to actions in [-1, 1].
 
     :param embed_dim: width D of the hidden states
     :param action_dim: A
@@ -40,7 +40,7 @@ class ActionHead(nn.Module, ABC):
 
     @property
     def noise_decides(self) -> bool:
-        """Whether other noise leads to other actions, as the head acts now."""
+        """Return whether other noise leads to other actions, as the head acts now."""
         return self.noise_dim > 0
 
     def deterministic_noise(self, generator: th.Generator) -> th.Tensor:

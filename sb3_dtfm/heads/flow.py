@@ -77,7 +77,7 @@ def interpolate(noise: th.Tensor, action: th.Tensor, tau: th.Tensor) -> tuple[th
 
 
 def in_turn(values: th.Tensor, context_length: int) -> th.Tensor:
-    """From N values a window, (B, N, ...), to one a step, (B, K, ...), over and over."""
+    """Repeat N values a window, (B, N, ...), in turn, to one a step, (B, K, ...)."""
     return values.repeat(1, -(-context_length // values.shape[1]), 1)[:, :context_length]
 
 
@@ -125,7 +125,7 @@ class FlowHead(ActionHead):
 
     @property
     def noise_decides(self) -> bool:
-        """Not with 0 solver steps, nor with one of Euler, which ends at the mean action from any noise."""
+        """Return False with 0 solver steps, or with one of Euler, which ends at the mean action from any noise."""
         solver, n_steps = self.options.flow_solver, self.options.flow_steps
         return solver == ONE_STEP or n_steps > (1 if solver == "euler" else 0)
 
@@ -204,7 +204,7 @@ class FlowHead(ActionHead):
         return self.solve(hidden, noise, self.options.flow_solver, self.options.flow_steps)
 
     def one_step_action(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
-        """From noise (..., A) to actions (..., A) in one step. No gradient flows into the field's W h + b."""
+        """Map noise (..., A) to actions (..., A) in one step. No gradient flows into the field's W h + b."""
         assert self.one_step_policy is not None
         change = self.one_step_policy(noise, self.one_step_policy.film_condition(hidden))
         return (self._regressed(hidden).detach() + change).tanh() if self.predicts_action else noise + change

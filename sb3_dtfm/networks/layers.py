@@ -38,7 +38,7 @@ class Linear(nn.Linear):
     """
 
     def forward(self, x: th.Tensor) -> th.Tensor:
-        """From (..., in_features) to (..., out_features)."""
+        """Map (..., in_features) to (..., out_features)."""
         n_rows = x.numel() // self.in_features
         if (
             th.compiler.is_compiling()  # a graph is for any number of rows
@@ -192,7 +192,7 @@ class VectorField(FilmNetwork):
 
 class ReturnFilm(nn.Module):
     """
-    From a return-to-go to scales and shifts for all blocks of the Transformer: an MLP of its sines and cosines.
+    A map from a return-to-go to scales and shifts of all blocks of the Transformer: an MLP of its sines and cosines.
 
     Scales start apart (standard deviation 0.2 of the last weights), so that returns that differ by a tenth are told apart
     from the first gradient step on.
@@ -211,7 +211,7 @@ class ReturnFilm(nn.Module):
         nn.init.zeros_(self.output.bias)
 
     def forward(self, returns_to_go: th.Tensor) -> th.Tensor:
-        """From (B, N), scaled and clipped at 10, to (B, N, 2 * embed_dim * n_blocks)."""
+        """Map (B, N), scaled and clipped at 10, to (B, N, 2 * embed_dim * n_blocks)."""
         returns_to_go = returns_to_go.clamp(-RETURN_CLIP, RETURN_CLIP)
         waves = sinusoidal_embedding(returns_to_go, RETURN_EMBEDDING_DIM, RETURN_FREQUENCIES)
         return self.output(F.silu(self.hidden(th.cat((returns_to_go.unsqueeze(-1), waves), dim=-1))))

@@ -111,7 +111,7 @@ class FlatAdamW(th.optim.AdamW):
         return self._weights.flat()
 
     def zero_grad(self, set_to_none: bool = True) -> None:
-        """torch's."""
+        """Reset gradients as torch does."""
         self._drop_gradients(set_to_none)
         self._gradient = None
 

@@ -204,7 +204,7 @@ class SequenceTrunk(nn.Module):
         return th.stack((return_to_go, observation + time, action + time), dim=2).flatten(1, 2)[:, :-1]
 
     def films(self, returns_to_go: th.Tensor) -> Sequence[th.Tensor | None]:
-        """From returns-to-go (B, N) to scales and shifts (B, L, 2 D) of each block's tokens, None where there are none."""
+        """Map returns-to-go (B, N) to scales and shifts (B, L, 2 D) of each block's tokens, None where there are none."""
         if self.film is None:
             return [None] * self.n_layers
         films = self.film(returns_to_go)
@@ -213,13 +213,13 @@ class SequenceTrunk(nn.Module):
         return films.chunk(self.n_layers, dim=-1)
 
     def _time(self, timesteps: th.Tensor) -> th.Tensor:
-        """What to add to the tokens of steps (B, N): embeddings (B, N, D), or zeros (B, N, 1) where there are none."""
+        """Return what is added to the tokens of steps (B, N): embeddings (B, N, D), or zeros (B, N, 1) without any."""
         if self.embed_timestep is None:
             return th.zeros_like(timesteps, dtype=self.final_norm.weight.dtype).unsqueeze(-1)
         return self.embed_timestep(timesteps.clamp(max=self.embed_timestep.num_embeddings - 1))
 
     def attention_bias(self, mask: th.Tensor, n_tokens: int) -> th.Tensor:
-        """From the steps' mask, (B, K), to what is added to the scores of their first tokens, (B, heads, L, L)."""
+        """Map the steps' mask, (B, K), to what is added to the scores of their first tokens, (B, heads, L, L)."""
         allowed = causal_mask(mask.repeat_interleave(self.tokens_per_step, dim=1)[:, :n_tokens])
         bias = th.zeros_like(allowed, dtype=self.final_norm.weight.dtype).masked_fill_(~allowed, -th.inf)
         return bias.expand(-1, self.n_heads, -1, -1)
@@ -241,7 +241,7 @@ def scale_and_shift(tokens: th.Tensor, film: th.Tensor | None) -> th.Tensor:
 
 def causal_mask(valid: th.Tensor) -> th.Tensor:
     """
-    Which tokens each token may attend to: itself, and the valid ones before it.
+    Return which tokens each token may attend to: itself, and the valid ones before it.
 
     :param valid: (B, L) bool
     :return: (B, 1, L, L) bool

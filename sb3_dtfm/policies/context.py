@@ -103,7 +103,7 @@ def check_episode_start(episode_start: Any, n_rows: int) -> np.ndarray:
 
 def restarts(context: Context, timestep: np.ndarray, episode_start: np.ndarray | None = None) -> np.ndarray:
     """
-    Where a new step begins a context of its own: at the start of an episode, and where it follows nothing.
+    Return where a new step begins a context of its own: at the start of an episode, and where it follows nothing.
 
     :param timestep: (B,) int64
     :param episode_start: (B,) bool, True where the caller says so

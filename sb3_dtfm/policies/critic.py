@@ -1,5 +1,5 @@
 """
-What actions are worth, learned from recorded data alone (IQL), so that the best of several drawn actions can be taken.
+Values of actions, learned from recorded data alone (IQL), so that the best of several drawn actions can be taken.
 
 Values are per unit of reward that :meth:`Critic.set_scale` chose; gradient steps are the algorithm's.
 """
@@ -73,7 +73,7 @@ class Critic(nn.Module):
 
     def gains(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
-        How much more than the first of N actions each of them is worth, by the Q that finds less: another one is worth more
+        Return how much more than the first of N actions each is worth, by the Q that finds less: another one is worth more
         only where both Qs say so. What they misjudge alike in all actions of an observation is no part of it.
 
         :param observations: (B, O), normalised

@@ -60,7 +60,7 @@ class ResidualExtractor(BaseFeaturesExtractor):
         self.linear = nn.Linear(2 * channels[-1], features_dim)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """From (N, channels, height, width) to (N, features_dim)."""
+        """Map (N, channels, height, width) to (N, features_dim)."""
         maps = self.blocks(F.relu(self.stem(self._crop(observations))))
         return self.linear(spatial_softmax(maps))
 
@@ -101,14 +101,14 @@ class ResidualBlock(nn.Module):
         self.shortcut = nn.Identity() if same else nn.Conv2d(n_in, n_out, kernel_size=1, stride=stride, bias=False)
 
     def forward(self, maps: th.Tensor) -> th.Tensor:
-        """From (N, n_in, height, width) to (N, n_out, height / stride, width / stride)."""
+        """Map (N, n_in, height, width) to (N, n_out, height / stride, width / stride)."""
         inner = F.relu(self.first_norm(self.first(maps)))
         return F.relu(self.shortcut(maps) + self.second_norm(self.second(inner)))
 
 
 def spatial_softmax(maps: th.Tensor) -> th.Tensor:
     """
-    Where each channel is largest: the mean position under its softmax.
+    Return where each channel is largest: the mean position under its softmax.
 
     :param maps: (N, C, height, width)
     :return: (N, 2 C) in [-1, 1], the rows of all channels, then the columns

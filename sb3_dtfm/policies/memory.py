@@ -26,7 +26,7 @@ class RememberedContext:
 
     def recall(self, observation: np.ndarray, timestep: np.ndarray) -> Context | None:
         """
-        What a new observation follows: the context after the last call, or before it where the same is asked again.
+        Return what a new observation follows: the context after the last call, or before it where the same is asked again.
 
         :param observation: (B, O)
         :param timestep: (B,)

@@ -58,7 +58,7 @@ class ReturnRange(nn.Module):
 
 class SequenceNetwork(nn.Module):
     """
-    From normalised windows to the loss, or to actions in [-1, 1].
+    A map from normalised windows to the loss, or to actions in [-1, 1].
 
     :param trunk: from windows to hidden states
     :param head: from hidden states to actions
@@ -124,16 +124,16 @@ class SequenceNetwork(nn.Module):
         return windows._replace(returns_to_go=self.return_range(windows.observations, windows.returns_to_go))
 
     def newest_hidden(self, windows: Windows) -> th.Tensor:
-        """From windows (B, K, ...) to hidden states (B, D) of their newest steps."""
+        """Map windows (B, K, ...) to hidden states (B, D) of their newest steps."""
         return self.trunk(**self.within_range(windows)._asdict(), last_only=True).squeeze(1)
 
     def decode(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
-        """From hidden states (..., D) and noise (..., N) to chunks (..., H A) in [-1, 1]."""
+        """Map hidden states (..., D) and noise (..., N) to chunks (..., H A) in [-1, 1]."""
         return self.head(hidden, noise).clamp(-1.0, 1.0)
 
 
 def chunks_of(batch: Windows) -> th.Tensor:
-    """From actions (B, K + H - 1, A) to the H from each of K steps on, (B, K, H A), one after the other."""
+    """Cut actions (B, K + H - 1, A) into the H from each of K steps on, (B, K, H A), one after the other."""
     n_actions, n_steps = batch.actions.shape[1], batch.mask.shape[1]
     return batch.actions.unfold(1, n_actions - n_steps + 1, 1).transpose(2, 3).flatten(2)
 

@@ -129,7 +129,7 @@ class Normalization(nn.Module):
         return self(batch._replace(actions=self.scale_action(batch.actions)))
 
     def _scale_return_to_go(self, returns_to_go: th.Tensor, timesteps: th.Tensor) -> th.Tensor:
-        """From environment reward units, (B, K), to about [-1, 1]."""
+        """Scale environment reward units, (B, K), to about [-1, 1]."""
         if self.return_scaling is None:
             return th.zeros_like(returns_to_go)
         timesteps = timesteps.clamp(max=self.max_timestep - 1)
@@ -147,7 +147,7 @@ class Normalization(nn.Module):
         return scaled.clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP) * self.observation_gain
 
     def scale_transitions(self, batch: Transitions) -> Transitions:
-        """Those of a buffer as a critic takes them: observations normalised, actions in [-1, 1]."""
+        """Scale a buffer's transitions as a critic takes them: observations normalised, actions in [-1, 1]."""
         actions = batch.actions.view(len(batch.actions), -1, len(self.action_low))
         return batch._replace(
             observations=self.scale_observation(batch.observations),
@@ -156,11 +156,11 @@ class Normalization(nn.Module):
         )
 
     def scale_action(self, action: Any) -> Any:
-        """From the environment's range to [-1, 1], (..., A)."""
+        """Scale the environment's range to [-1, 1], (..., A)."""
         return 2.0 * (action - self.action_low) / (self.action_high - self.action_low) - 1.0
 
     def unscale_action(self, action: th.Tensor) -> th.Tensor:
-        """From [-1, 1] to the environment's range and no further, (..., A)."""
+        """Scale [-1, 1] to the environment's range and no further, (..., A)."""
         low, high = self.action_low, self.action_high
         clamped: th.Tensor = unscaled(action, low, high).clamp(low, high)
         return clamped

@@ -25,7 +25,7 @@ class Extractor:
     """The name of a class for images."""
 
     def accepts(self, value: Any) -> bool:
-        """Whether it is one."""
+        """Return whether it is one."""
         return isinstance(value, str) and value in EXTRACTORS
 
     def __str__(self) -> str:
@@ -36,7 +36,7 @@ class Arguments:
     """Arguments by name."""
 
     def accepts(self, value: Any) -> bool:
-        """Whether it is a mapping by name, or None."""
+        """Return whether it is a mapping by name, or None."""
         return value is None or (isinstance(value, Mapping) and all(isinstance(name, str) for name in value))
 
     def __str__(self) -> str:

@@ -49,6 +49,6 @@ class ResNet18(BaseFeaturesExtractor):
         self.register_buffer("std", th.tensor(STD).view(3, 1, 1), persistent=False)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        """From (N, 3, height, width) to (N, features_dim)."""
+        """Map (N, 3, height, width) to (N, features_dim)."""
         features: th.Tensor = self.network((observations - self.mean) / self.std)
         return features

@@ -257,7 +257,7 @@ class SequencePolicy(BasePolicy):
 
     def best_of_n_share(self, batch: Windows, generator: th.Generator) -> th.Tensor:
         """
-        How often the critic has another sample taken than the first one, at the newest steps of windows.
+        Return how often the critic has another sample taken than the first one, at the newest steps of windows.
 
         :param batch: windows of a buffer
         :param generator: decides which rows of the noise table
@@ -411,7 +411,7 @@ class SequencePolicy(BasePolicy):
         self._remembered.forget()
 
     def _to_environment(self, scaled_action: np.ndarray) -> np.ndarray:
-        """From [-1, 1] into the action space, in its own precision."""
+        """Bring [-1, 1] into the action space, in its own precision."""
         low, high = self.vector_space.low, self.vector_space.high
         action = unscaled(scaled_action, low, high).astype(self.vector_space.dtype)
         return from_vectors(np.clip(action, low, high), self.action_space)
@@ -452,7 +452,7 @@ class SequencePolicy(BasePolicy):
 
     @property
     def takes_best_of_n(self) -> bool:
-        """Whether the critic chooses among several samples as the policy acts now."""
+        """Return whether the critic chooses among several samples as the policy acts now."""
         return self.options.n_action_samples > 1 and self.online_actor is None
 
     def _choose(self, context: Context, due: np.ndarray, hidden: th.Tensor, deterministic: bool) -> th.Tensor:
@@ -514,11 +514,11 @@ class SequencePolicy(BasePolicy):
         return (hidden[th.from_numpy(due).to(device)] if due.any() else None), keys_values
 
     def _to_chunks(self, actions: th.Tensor) -> np.ndarray:
-        """From (b, H A) to (b, H, A) on the CPU."""
+        """Bring (b, H A) to (b, H, A) on the CPU."""
         return actions.cpu().numpy().reshape(-1, self.options.chunk_size, self.action_dim)
 
     def _acting_noise(self, rows: np.ndarray, deterministic: bool) -> th.Tensor:
-        """What the newest step's actions start from, (B, noise_dim): of these rows of the table, (B,), or fresh."""
+        """Return what the newest step's actions start from, (B, noise_dim): of these rows of the table, (B,), or fresh."""
         if deterministic or self.network.head.noise_dim == 0:
             return self.noise_table[th.from_numpy(rows % len(self.noise_table)).to(self.noise_table.device)]
         if self._acting_generator is None:
@@ -550,7 +550,7 @@ class SequencePolicy(BasePolicy):
         return self._predict(observation, deterministic)
 
     def acting_settings(self) -> dict[str, Any]:
-        """How to act: what may be changed after training, and is saved with the weights."""
+        """Return how to act: what may be changed after training, and is saved with the weights."""
         return {**self.options.acting(), **self.network.head.options.acting()}
 
     def set_acting(self, **settings: Any) -> None:
@@ -598,7 +598,7 @@ def choose_actions(
     noise: th.Tensor,
 ) -> th.Tensor:
     """
-    From hidden states and noise to actions: what `predict` and exported files do alike.
+    Map hidden states and noise to actions: what `predict` and exported files do alike.
 
     :param network: that acts
     :param normalization: of the policy

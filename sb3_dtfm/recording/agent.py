@@ -141,7 +141,7 @@ def _make(env_id: str, kwargs: dict[str, Any], picture_size: int | None) -> gym.
 
 
 def _without_picture(recorder: EpisodeRecorder) -> gym.Env:
-    """What stands around a recorder, as if the environment inside were not rendered."""
+    """Return what stands around a recorder, as if the environment inside were not rendered."""
     space = recorder.env.get_wrapper_attr("env").observation_space
     in_dict = isinstance(space, spaces.Dict)
     return TransformObservation(recorder, lambda seen: {key: seen[key] for key in space} if in_dict else seen[STATE], space)

@@ -118,7 +118,7 @@ def known_algorithms() -> dict[str, type[BaseAlgorithm]]:
 
 def algorithm_of(model: str | Path) -> str:
     """
-    Which of ours a model is, by the folder of RL-Zoo's that it lies in.
+    Return which of ours a model is, by the folder of RL-Zoo's that it lies in.
 
     :param model: zip file or run folder, below a folder `dt` or `dtfm`
     :raises ValueError: there is none
@@ -249,6 +249,6 @@ def _check_not_normalized(model: BaseAlgorithm, path: Path) -> None:
 
 
 def _dtypes(observation: Any) -> list[np.dtype]:
-    """Of an array, or of each in a dict; none of None."""
+    """Return the type of an array, or of each in a dict; no type for None."""
     parts = observation.values() if isinstance(observation, dict) else [observation]
     return [part.dtype for part in parts if part is not None]

@@ -40,7 +40,7 @@ class OnnxAgent:
         self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[np.ndarray, None]:
         """
-        As Stable-Baselines3's agents do.
+        Predict as Stable-Baselines3's agents do.
 
         :param observation: (N, O)
         :param state: there is none

@@ -85,7 +85,7 @@ def finetune(
 
 
 def _train(command: str, manager: Any, arguments: Sequence[str], restored: Restored | None) -> None:
-    """RL-Zoo's `train`; what a run's folder says is neither evaluated nor imported."""
+    """Call RL-Zoo's `train`; what a run's folder says is neither evaluated nor imported."""
     script: Any = rl_zoo3.train
     script.ExperimentManager = manager
     script.StoreDict = StoreValues if restored is None else StoreLiterals
@@ -138,7 +138,7 @@ def record_video(model: FoundModel, arguments: Sequence[str]) -> None:
 
 def _without_pickles(model: FoundModel, *args: Any, **kwargs: Any) -> VecEnv:
     """
-    RL-Zoo's `create_test_env`; VecNormalize's pickled statistics are loaded only beside a model that is a pickle, too.
+    Call RL-Zoo's `create_test_env`; VecNormalize's pickled statistics are loaded only beside a model that is a pickle, too.
 
     :raises DatasetError: an action does something else there than in the data of the model
     """
@@ -163,8 +163,8 @@ def plot(name: str, arguments: Sequence[str]) -> None:
 
 def find_model(exp_id: int, folder: str, algo: str, env_name: EnvironmentName, *args: Any, **kwargs: Any) -> FoundModel:
     """
-    RL-Zoo's `get_model_path`; but the latest run is the latest that has such a model, as a search for hyperparameters and a
-    run that has just begun have none.
+    Find a model as RL-Zoo's `get_model_path` does; but the latest run is the latest that has such a model, as a search for
+    hyperparameters and a run that has just begun have none.
 
     :param exp_id: number of a run, 0 for the latest, -1 for no folder of a run
     :param folder: of all runs

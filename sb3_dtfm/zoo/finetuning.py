@@ -79,7 +79,7 @@ class FinetunedCallbacks(BaseCallback):
             self.inner.on_training_end()
 
     def _looking(self) -> list[tuple[BaseCallback, int]]:
-        """Those of the callbacks that look at the model now and then, and how often."""
+        """Return the callbacks that look at the model now and then, and how often."""
         frequencies = (
             (each, getattr(each, "eval_freq", 0) or getattr(each, "save_freq", 0)) for each in self.inner.callbacks
         )
@@ -92,7 +92,7 @@ class FinetunedCallbacks(BaseCallback):
 
 
 def has_learned(agent: BaseAlgorithm) -> bool:
-    """Whether an algorithm has done a gradient step."""
+    """Return whether an algorithm has done a gradient step."""
     return getattr(agent, "_n_updates", 0) > 0
 
 
@@ -140,7 +140,7 @@ class FinetuningManager(OfflineExperimentManager):
             raise FileNotFoundError(f"{self.base_file} does not exist; --model names a DTFM's zip file or its run's folder.")
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """RL-Zoo's; what the environment was to the DTFM comes from its run."""
+        """Read settings as RL-Zoo does; those of the environment come from the DTFM's run."""
         hyperparams, _ = super().read_hyperparameters()
         run = self.base_file.parent / self.env_name
         known = read_run(run) if (run / "config.yml").is_file() else {}
@@ -185,7 +185,7 @@ class FinetunedManager(FinetuningManager):
         self.params_path = f"{self.save_path}/{self.env_name}"
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Those of the online algorithm, and of the wrapper that it learns in."""
+        """Read the settings of the online algorithm, and of the wrapper that it learns in."""
         hyperparams, _ = super().read_hyperparameters()
         key, arguments = self._frozen_env(hyperparams)
         residual = FROZEN_ENVS[key] is ResidualActionVecEnv
@@ -214,7 +214,7 @@ class FinetunedManager(FinetuningManager):
         return key, dict(arguments or {})
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
-        """RL-Zoo's; the fine-tuned model is evaluated in the environment itself."""
+        """Create environments as RL-Zoo does; the fine-tuned model is evaluated in the environment itself."""
         wrapper = self.vec_env_wrapper
         try:
             if eval_env:
@@ -224,7 +224,7 @@ class FinetunedManager(FinetuningManager):
             self.vec_env_wrapper = wrapper
 
     def create_callbacks(self) -> None:
-        """RL-Zoo's; evaluations and checkpoints are of the fine-tuned model."""
+        """Create callbacks as RL-Zoo does; evaluations and checkpoints are of the fine-tuned model."""
         super().create_callbacks()
         of_the_model: list[BaseCallback] = [
             each for each in self.callbacks if isinstance(each, EvalCallback | CheckpointCallback)
@@ -234,7 +234,7 @@ class FinetunedManager(FinetuningManager):
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """
-        RL-Zoo's.
+        Set up as RL-Zoo does.
 
         :raises ValueError: an actor that cannot be taken over
         """
@@ -293,7 +293,7 @@ class OnlineManager(FinetuningManager):
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """
-        Those of online learning.
+        Read the settings of online learning.
 
         :raises UsageError: no dataset, or a name that it does not know
         """
@@ -309,7 +309,7 @@ class OnlineManager(FinetuningManager):
         return hyperparams, saved
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
-        """RL-Zoo's, by this algorithm."""
+        """Load an agent as RL-Zoo does, by this algorithm."""
         settings = {key: value for key, value in hyperparams.items() if key != "policy"}
         about: dict[str, Any] = dict(
             seed=self.seed, tensorboard_log=self.tensorboard_log, verbose=self.verbose, device=self.device
@@ -327,14 +327,14 @@ class OnlineManager(FinetuningManager):
         return model
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
-        """RL-Zoo's; the monitors of a run that is resumed are written on."""
+        """Create environments as RL-Zoo does; a resumed run appends to its monitors."""
         if self.resumed is not None:
             self.monitor_kwargs = {**self.monitor_kwargs, "override_existing": False}
         return super().create_envs(n_envs, eval_env, no_log)
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """
-        RL-Zoo's, and the own episodes.
+        Save the model as RL-Zoo does, and the own episodes.
 
         :param model: trained
         :raises SystemExit: SIGTERM has ended the run

@@ -43,7 +43,7 @@ class Settings(NamedTuple):
 
     @property
     def model_name(self) -> ModelName:
-        """Of the model and, by default, of its repository."""
+        """Name of the model and, by default, of its repository."""
         return ModelName(self.algo, EnvironmentName(self.env))
 
     def write(self, folder: Path) -> None:
@@ -63,7 +63,7 @@ class Settings(NamedTuple):
     @classmethod
     def read(cls, folder: Path) -> "Settings":
         """
-        What others wrote: read as data, and checked.
+        Read what others wrote as data, and check it.
 
         :param folder: of the repository
         :raises FileNotFoundError: `sb3-dtfm push` did not make it
@@ -85,7 +85,7 @@ class Settings(NamedTuple):
 
     def write_run(self, run: Path) -> None:
         """
-        What RL-Zoo's `enjoy` reads, in plain YAML.
+        Write what RL-Zoo's `enjoy` reads, in plain YAML.
 
         :param run: the run's folder
         """
@@ -263,7 +263,7 @@ def _reason(error: Exception) -> str:
 
 
 def _shown(value: Any) -> Any:
-    """For everybody to read: plain containers, and nothing of where files lie on a machine."""
+    """Prepare settings for everybody to read: plain containers, and no path of a machine."""
     if isinstance(value, Mapping):
         return {str(key): _shown(part) for key, part in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):

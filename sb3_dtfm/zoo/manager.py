@@ -36,7 +36,7 @@ OF_RL_ZOO = ("n_timesteps", "n_envs", "normalize", "frame_stack", "callback", "e
 
 
 class TrialNumber(int):
-    """Of a study; RL-Zoo takes none for no number, which 0 would be."""
+    """Number of a study's trial, true even if it is 0: RL-Zoo takes what is false for no number."""
 
     def __bool__(self) -> bool:
         return True
@@ -128,7 +128,7 @@ class OfflineExperimentManager(ExperimentManager):
                     raise UsageError(f"{name}: expected the dotted name of a {CLASSES[name]} in quotes, got {named!r}.")
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """RL-Zoo's; options of the policy may stand beside the algorithm's, and the ReturnToGoWrapper may be left out."""
+        """Read settings as RL-Zoo does; policy options may stand among them, and the ReturnToGoWrapper may be left out."""
         hyperparams, saved = super().read_hyperparameters()
         if self.restored is not None:
             hyperparams = self.restored.check_config(self.config, hyperparams)
@@ -151,11 +151,11 @@ class OfflineExperimentManager(ExperimentManager):
 
     @property
     def learns_offline(self) -> bool:
-        """Whether a timestep is a gradient step on recorded episodes."""
+        """Return whether a timestep is a gradient step on recorded episodes."""
         return self.algo in ALGORITHMS and self.command == "train"
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
-        """RL-Zoo's, which makes the run's folder before its model."""
+        """Set up as RL-Zoo does, which makes the run's folder before its model."""
         try:
             made = super().setup_experiment()
             if made is not None and self.learns_offline:
@@ -192,14 +192,14 @@ class OfflineExperimentManager(ExperimentManager):
             raise UsageError(f"{with_nearest(unknown, known)}: no hyperparameter of {self.algo}.") from error
 
     def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
-        """RL-Zoo's; dt and dtfm need none of the pickled statistics that it would load from beside a trained agent."""
+        """Normalise as RL-Zoo does; dt and dtfm need no pickled statistics from beside a trained agent."""
         if self.algo not in ALGORITHMS:
             return super()._maybe_normalize(env, eval_env)
         of_evaluations = {"norm_reward": False, "training": False} if eval_env else {}
         return VecNormalize(env, **{**self.normalize_kwargs, **of_evaluations}) if self.normalize else env
 
     def objective(self, trial: optuna.Trial) -> float:
-        """RL-Zoo's, of a search; a trial that diverges or needs too much memory is one without a value."""
+        """Run a trial as RL-Zoo does; one that diverges or needs too much memory has no value."""
         try:
             return super().objective(trial)
         except (FloatingPointError, MemoryError, optuna.TrialPruned) as error:
@@ -209,7 +209,7 @@ class OfflineExperimentManager(ExperimentManager):
 
     def hyperparameters_optimization(self) -> None:
         """
-        RL-Zoo's.
+        Search as RL-Zoo does.
 
         :raises UsageError: no trial has a value, so none is the best, and why the last one has none
         """
@@ -221,7 +221,7 @@ class OfflineExperimentManager(ExperimentManager):
             raise UsageError(f"{error} Of {len(self.valueless)} the last ended by {self.valueless[-1]}") from error
 
     def create_callbacks(self) -> None:
-        """RL-Zoo's, and the evaluations that a count of full intervals leaves out."""
+        """Create callbacks as RL-Zoo does, and the evaluations that a count of full intervals leaves out."""
         if not is_first_process():
             self.callbacks = []
             return
@@ -243,7 +243,7 @@ class OfflineExperimentManager(ExperimentManager):
 
     def learn(self, model: BaseAlgorithm) -> None:
         """
-        RL-Zoo's; a run that is resumed has the rest of its steps before it.
+        Train as RL-Zoo does; a run that is resumed has the rest of its steps before it.
 
         :param model: to train
         :raises TrainingError: whatever went wrong
@@ -276,7 +276,7 @@ class OfflineExperimentManager(ExperimentManager):
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """
-        RL-Zoo's. An interrupted run keeps what it can go on from, a finished one does not.
+        Save the model as RL-Zoo does. An interrupted run keeps what it can go on from, a finished one does not.
 
         :param model: trained
         :raises SystemExit: SIGTERM has ended the run

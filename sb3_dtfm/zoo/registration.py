@@ -47,7 +47,7 @@ def packaged_config(algo: str, name: str | None = None) -> Path:
 
 
 def is_packaged(path: str) -> bool:
-    """Whether settings came with the package."""
+    """Return whether settings came with the package."""
     return Path(str(resources.files(PACKAGED_CONFIGS[None]))).resolve() in Path(path).resolve().parents
 
 

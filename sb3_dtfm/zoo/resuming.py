@@ -36,7 +36,7 @@ STOPPING = b"\nStopping after this gradient step, or in the midst of an evaluati
 
 class Start(NamedTuple):
     """
-    How a run was started.
+    The start of a run.
 
     :param arguments: of RL-Zoo's `train`, or those of the command
     :param tensorboard: folder of its curves, None for none
@@ -109,7 +109,7 @@ class StopSignals:
 
     @contextlib.contextmanager
     def caught(self) -> Iterator[None]:
-        """While training."""
+        """Catch signals while training."""
         if dist.is_initialized() or threading.current_thread() is not threading.main_thread():
             yield
             return
@@ -136,7 +136,7 @@ class StopSignals:
 
     def end_evaluation(self, *_: Any) -> None:
         """
-        Between two steps of an evaluation, as `evaluate_policy` calls it.
+        End an evaluation between two of its steps, as `evaluate_policy` calls it.
 
         :raises KeyboardInterrupt: one of them has come
         """
@@ -241,7 +241,7 @@ class ReplaceEvaluations(BaseCallback):
                 evaluation.log_path = str(beside.with_suffix(""))  # NumPy adds it
 
     def drop_unfinished(self) -> None:
-        """What a killed process has left is perhaps not whole."""
+        """Drop what a killed process has left, which is perhaps not whole."""
         for beside, _ in self.files:
             beside.unlink(missing_ok=True)
 
@@ -302,7 +302,7 @@ def go_on(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], start: Start)
 
 def _take_up_evaluations(callback: EvalCallback, path: Path, num_timesteps: int) -> None:
     """
-    Those up to the checkpoint; the run comes to the others again.
+    Keep the evaluations up to the checkpoint; the run comes to the others again.
 
     :raises UsageError: there are none to tell how good the best model is
     """

@@ -46,7 +46,7 @@ def joined_processes(arguments: Sequence[str]) -> Iterator[list[str]]:
 
 
 def _options(arguments: Sequence[str]) -> argparse.Namespace:
-    """Those of RL-Zoo's options that matter here."""
+    """Parse those of RL-Zoo's options that matter here."""
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--algo")
     parser.add_argument("--device", default="auto")
@@ -64,7 +64,7 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _take_own_gpu() -> None:
-    """From here on, "cuda" is the GPU of this process."""
+    """Make "cuda" the GPU of this process from here on."""
     rank, n_gpus = int(os.environ["LOCAL_RANK"]), th.cuda.device_count()
     if rank >= n_gpus:
         raise UsageError(

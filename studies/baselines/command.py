@@ -101,7 +101,7 @@ def choose(names: Sequence[str] | None, known: Sequence[str], option: str) -> li
 
 def ready(data: Data, named: bool) -> bool:
     """
-    Whether the task is installed and the data can be read.
+    Return whether the task is installed and the data can be read.
 
     :param named: the user named it; otherwise it is left out, with a message, if its task's package is missing
     :raises UsageError: a package is missing, or the dataset

@@ -65,7 +65,7 @@ class Data(NamedTuple):
         return int(self._our_settings()["n_timesteps"])
 
     def settings(self) -> dict[str, Any]:
-        """What our own runs are told of data and environment."""
+        """Return what our own runs are told of data and environment."""
         found = self._our_settings()
         names = ("dataset", "dataset_kwargs", "env_wrapper", "env_kwargs")
         return {name: found[name] for name in names if name in found}
@@ -136,7 +136,7 @@ def read_entries(path: Path, entry: type[Any]) -> dict[str, Any]:
 
 
 def baseline_key(data: Data, baseline: Baseline, seed: int, label: str = "") -> RunKey:
-    """What a baseline's training on a dataset is known by."""
+    """Return what a baseline's training on a dataset is known by."""
     return RunKey(data.task, data.fraction, baseline.name, seed, PROFILE, "-".join(filter(None, (data.name, label))))
 
 
@@ -159,7 +159,7 @@ def export(data: Data, baseline: Baseline, path: Path, max_episode_steps: int | 
 
 class Budget(NamedTuple):
     """
-    How long a baseline learns.
+    The length of a baseline's training.
 
     :param n_timesteps: gradient steps, at most
     :param minutes: of one core, at most; None for all of these steps
@@ -170,14 +170,14 @@ class Budget(NamedTuple):
 
 
 def budget_of(data: Data, baseline: Baseline, options: argparse.Namespace) -> Budget:
-    """As asked for, or else the authors' steps in the minutes of the dataset."""
+    """Return the budget that was asked for, or else the authors' steps in the minutes of the dataset."""
     if options.steps is not None:
         return Budget(options.steps, None)
     return Budget(baseline.n_timesteps, float(data.minutes if options.minutes is None else options.minutes))
 
 
 def row_settings(data: Data, baseline: Baseline, budget: Budget) -> dict[str, Any]:
-    """What a row has for settings: the episodes, the environment, the budget, and the worker's."""
+    """Return what a row has for settings: the episodes, the environment, the budget, and the worker's."""
     share = {} if baseline.best_share is None else {"best_share": baseline.best_share}
     return {
         **data.settings(),

@@ -23,7 +23,7 @@ class BaselineError(RuntimeError):
 
 class Training(NamedTuple):
     """
-    What a training came to.
+    Results of a training.
 
     :param n_steps: gradient steps
     :param seconds: wall-clock time

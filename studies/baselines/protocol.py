@@ -24,7 +24,7 @@ TIMED_ACTIONS = 16
 
 class Message(NamedTuple):
     """
-    What one side says.
+    A message of one side.
 
     :param what: for example "train"
     :param values: anything that JSON holds
@@ -85,7 +85,7 @@ class Episode(NamedTuple):
 
 class Dataset(NamedTuple):
     """
-    What a baseline learns from.
+    Data that a baseline learns from.
 
     :param episodes: at least one
     :param low: (A,) smallest action
@@ -130,7 +130,7 @@ class Learner(Protocol):
 
     def actor(self) -> Callable[[np.ndarray, float, bool], np.ndarray]:
         """
-        What acts in one environment: observation (O,), return-to-go in reward units and whether an episode starts, to
+        Return what acts in one environment: observation (O,), return-to-go in reward units and whether an episode starts, to
         action (A,) in [-1, 1].
         """
 
@@ -187,7 +187,7 @@ def _train(job: dict[str, Any], make: MakeLearner, dataset: Dataset, stream: Bin
 
 
 def _milliseconds(times: list[float]) -> float:
-    """As `sb3_dtfm.benchmark.evaluation.action_ms`: the median of the means over blocks."""
+    """Measure as `sb3_dtfm.benchmark.evaluation.action_ms` does: the median of the means over blocks."""
     n_blocks = max(1, len(times) // TIMED_ACTIONS)
     return 1e3 * float(np.median([np.mean(block) for block in np.array_split(times, n_blocks)]))
 

@@ -107,7 +107,7 @@ def _encoders(settings: dict[str, Any], fields: set[str]) -> dict[str, Any]:
 
 
 def _optimizers(settings: dict[str, Any], fields: set[str], n_steps: int) -> dict[str, Any]:
-    """Those that differ from d3rlpy's, which is Adam at a constant learning rate."""
+    """Return the optimisers that differ from d3rlpy's, which is Adam at a constant learning rate."""
     if settings.get("cosine"):
         schedule = d3rlpy.optimizers.CosineAnnealingLRFactory(T_max=n_steps)
         return {"actor_optim_factory": d3rlpy.optimizers.AdamFactory(lr_scheduler_factory=schedule)}

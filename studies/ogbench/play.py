@@ -106,7 +106,7 @@ class Recorder:
 
 def is_visible(qpos: np.ndarray) -> bool:
     """
-    Whether the scene's cube stays on the table or in the drawer: the published generator repeats other episodes.
+    Return whether the scene's cube stays on the table or in the drawer: the published generator repeats other episodes.
 
     :param qpos: (T, .) of the scene
     """
@@ -135,7 +135,7 @@ def join(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 def describe(arrays: dict[str, np.ndarray]) -> str:
-    """What can be compared with what is published of a data set."""
+    """Return what can be compared with what is published of a data set."""
     observations, actions = arrays["observations"], arrays["actions"]
     reached, targets = arrays["n_reached"], arrays["n_targets"]
     return (

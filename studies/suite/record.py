@@ -89,7 +89,7 @@ def train(name: str) -> None:
 
 class Recorder:
     """
-    What makes each data set, by its name: functions that leave alone what is there.
+    Makers of each data set, by its name: functions that leave alone what is there.
 
     :param shared: folder of `agents/` and `data/`
     """
@@ -119,7 +119,7 @@ class Recorder:
             run([str(minari), "combine", "--dataset-id", dataset_id, *parts])
 
     def several_agents(self, dataset_id: str, env_id: str, models: list[str], episodes: int, *options: str) -> None:
-        """As many episodes of each of several agents."""
+        """Record as many episodes of each of several agents."""
         parts = [f"{dataset_id.rsplit('-', 1)[0]}-{model}-v0" for model in models]
         for part, model in zip(parts, models, strict=True):
             self.agent(part, model, env_id, episodes, "--stochastic", *options)
@@ -167,7 +167,7 @@ class Recorder:
 
 
 def steps(recorder: Recorder) -> dict[str, Callable[[], None]]:
-    """What makes each data set."""
+    """Return what makes each data set."""
     r = recorder
     everyone = ["tqc", "sac", "ppo", "a2c", "trpo"]
     noisy = ("--noise", "0.1")

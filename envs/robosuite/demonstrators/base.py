@@ -22,7 +22,7 @@ FINGERS_STILL = 4e-4  # metres per step
 
 class Manner:
     """
-    How one person would do one episode, drawn at random.
+    One person's manner of doing one episode, drawn at random.
 
     :param rng: source of randomness
     :param speed_range: between which `speed` is drawn
@@ -111,7 +111,7 @@ class Demonstrator:
 
     def _look(self, observation: np.ndarray) -> np.ndarray:
         """
-        Where to grasp the object or hold it, (3,) metres; the hand's orientation is chosen here too, where that matters.
+        Return where to grasp or hold the object, (3,) metres; the hand's orientation is chosen here too, where it matters.
 
         :param observation: (O,) float64
         """

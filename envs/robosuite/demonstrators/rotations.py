@@ -34,7 +34,7 @@ def downward(yaw: float) -> np.ndarray:
 
 def hand_yaw(quaternion: np.ndarray) -> float:
     """
-    How far a hand that points down is turned about the vertical, radians.
+    Return how far a hand that points down is turned about the vertical, radians.
 
     :param quaternion: (4,) x y z w
     """
@@ -43,7 +43,7 @@ def hand_yaw(quaternion: np.ndarray) -> float:
 
 def object_yaw(quaternion: np.ndarray) -> float:
     """
-    How far an object that lies flat is turned about the vertical, radians in [-pi, pi].
+    Return how far an object that lies flat is turned about the vertical, radians in [-pi, pi].
 
     :param quaternion: (4,) x y z w
     """

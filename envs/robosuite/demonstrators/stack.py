@@ -38,7 +38,7 @@ class StackDemonstrator(PlacingDemonstrator):
 
 def _grasp_yaw(cube: float, neighbour: float) -> float:
     """
-    How the hand turns for two faces of a cube, so that neither finger comes down towards its neighbour.
+    Return how the hand turns for two faces of a cube, so that neither finger comes down towards its neighbour.
 
     :param cube: its yaw, radians
     :param neighbour: the direction of the other cube, radians

@@ -222,7 +222,7 @@ def _figure(group: Group, tasks: Sequence[str], output: Path, x_label: str) -> I
 
 
 def _save(figure: "Figure", axes: Iterable["Axes"], output: Path, **legend: Any) -> None:
-    """With one legend of all that is drawn."""
+    """Save a figure with one legend of all that is drawn."""
     handles = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside upper center", frameon=False, **legend)
     figure.align_ylabels()

@@ -1,4 +1,4 @@
-"""From results to runs: what each training run achieved, and how runs of several seeds are summed up."""
+"""Training runs made of results: what each achieved, and how runs of several seeds are summed up."""
 
 import math
 import os
@@ -36,7 +36,7 @@ class Run(NamedTuple):
 
     @property
     def counts_success(self) -> bool:
-        """Whether its task reports success; the mean return measures it otherwise."""
+        """Return whether its task reports success; the mean return measures it otherwise."""
         return self.final["successes"] is not None
 
     def value(self, measure: str) -> float | None:
@@ -73,7 +73,7 @@ class Run(NamedTuple):
 
     @property
     def knows_random(self) -> bool:
-        """Whether the return of random actions was measured, as it is since rows tell of the best tenth, too."""
+        """Return whether the return of random actions was measured, as it is since rows tell of the best tenth, too."""
         return not self.counts_success and "random_return" in self.final["data"]
 
     @property
@@ -182,7 +182,7 @@ class Group(NamedTuple):
 
     @property
     def has_baselines(self) -> bool:
-        """Whether behaviour cloning was run, too."""
+        """Return whether behaviour cloning was run, too."""
         return any(algo in BASELINES for _, _, algo in self.runs)
 
     @property
@@ -192,7 +192,7 @@ class Group(NamedTuple):
 
     @property
     def data_sets(self) -> list[tuple[str, str, float]]:
-        """Of all that were run: a name, with a star where a default was chosen with it, the task, the share of its data."""
+        """Describe all data sets: a name, with a star where a default was chosen with it, the task, its share of data."""
         found = []
         for task, regime in sorted({(task, regime) for task, regime, _ in self.runs}):
             star = "*" if any(run.final["data"].get("chosen_with") for run in self.of_task(task)) else ""
@@ -202,12 +202,12 @@ class Group(NamedTuple):
 
     @property
     def compares(self) -> bool:
-        """Whether several algorithms were run."""
+        """Return whether several algorithms were run."""
         return len({algo for _, _, algo in self.runs}) > 1
 
     @property
     def success_tasks(self) -> list[str]:
-        """Those with runs, all of which report success."""
+        """Return the tasks with runs, all of which report success."""
         return [task for task in self.tasks if (runs := self.of_task(task)) and all(run.counts_success for run in runs)]
 
     def of(self, task: str, regime: float, algo: str) -> list[Run]:
