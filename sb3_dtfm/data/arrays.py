@@ -16,7 +16,7 @@ import numpy as np
 
 from sb3_dtfm.data.arrow import as_numbers, import_pyarrow
 from sb3_dtfm.data.cache import existing_file
-from sb3_dtfm.data.hdf5 import check_within, read_hdf5
+from sb3_dtfm.data.hdf5 import check_within, describe_hdf5, read_hdf5
 from sb3_dtfm.data.observations import as_vectors
 from sb3_dtfm.data.trajectories import DatasetError, check_real, check_size, wrap_dataset_errors
 
@@ -94,6 +94,10 @@ class Arrays(ABC):
             raise DatasetError(f"{where} has shape {array.shape} and actions have {n_steps} steps.")
         return array
 
+    def describe(self, name: str) -> tuple[tuple[int, ...], np.dtype] | None:
+        """Return shape and type of an array without reading it; None where there is none, or nothing tells."""
+        return None
+
     def env_id(self) -> str | None:
         """The environment that :meth:`TrajectoryBuffer.save` has written."""
         return None
@@ -129,14 +133,23 @@ class _Npz(Arrays):
         with self._archive.open(self._members[name]) as stream:
             return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
 
-    def _header(self, name: str, where: str) -> np.dtype:
-        """Refuse what an array claims to be before memory is taken for it."""
+    def describe(self, name: str) -> tuple[tuple[int, ...], np.dtype] | None:
+        with contextlib.suppress(Exception):  # over damaged files they raise nearly everything, and this is not read
+            return self._claims(name)[:2]
+        return None
+
+    def _claims(self, name: str) -> tuple[tuple[int, ...], np.dtype, int]:
+        """Return shape and type of an array, and the number of bytes behind its header."""
         member = self._members[name]
         with self._archive.open(member) as stream:
             version = np.lib.format.read_magic(stream)
             read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
             shape, _, dtype = read_header(stream)
-            n_left = member.file_size - stream.tell()
+            return shape, dtype, member.file_size - stream.tell()
+
+    def _header(self, name: str, where: str) -> np.dtype:
+        """Refuse what an array claims to be before memory is taken for it."""
+        shape, dtype, n_left = self._claims(name)
         n_bytes = math.prod(shape) * dtype.itemsize
         if n_bytes != n_left and not dtype.hasobject:
             raise DatasetError(f"{where} has shape {shape}, which takes {n_bytes} bytes; there are {n_left}.")
@@ -157,6 +170,9 @@ class _Hdf5(Arrays):
     def _get(self, name: str, where: str) -> np.ndarray:
         return read_hdf5(self._file, name, self.source)
 
+    def describe(self, name: str) -> tuple[tuple[int, ...], np.dtype] | None:
+        return describe_hdf5(self._file, name, self.source)
+
 
 class _InMemory(Arrays):
     """Arrays in memory; observations may be a dictionary of arrays."""
@@ -169,6 +185,10 @@ class _InMemory(Arrays):
         found = self._arrays[name]
         with wrap_dataset_errors(where, NUMBERS_EXPECTED):
             return found if isinstance(found, Mapping) else np.asarray(found)
+
+    def describe(self, name: str) -> tuple[tuple[int, ...], np.dtype] | None:
+        found = self._arrays[name]
+        return (found.shape, found.dtype) if isinstance(found, np.ndarray) else None
 
     def read(self, names: Sequence[str], n_steps: int | None = None) -> np.ndarray:
         name = self.name(names)

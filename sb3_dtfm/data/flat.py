@@ -4,7 +4,7 @@ import contextlib
 import itertools
 import os
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ from sb3_dtfm.data.observations import Observed, is_images, observed, part_of
 from sb3_dtfm.data.short_episodes import ShortEpisodes, blocks
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import ActionRangeError, DatasetError, Trajectory, check_flags
-from sb3_dtfm.envs.return_to_go import IMAGE
+from sb3_dtfm.envs.return_to_go import CHANNELS, IMAGE
 from sb3_dtfm.envs.success import SUCCESS
 
 # What others call the same array: the first that is there is read.
@@ -163,10 +163,23 @@ def load_flat(
         keys = list(observation_keys or arrays.columns(OBSERVATIONS))
         if observation_keys is None:
             keys += [name for name in arrays.names if name.startswith(STORED_IMAGE)]
+            _warn_of_images(arrays, {*keys, *action_keys, *NOT_NEEDED}, len(actions))
         observations = _observations(arrays, keys, len(actions), observation_space)
         ends = _ends(arrays, len(actions), max_episode_steps)
         warn_of_made_up_rewards(set(map(str, arrays.names)) - {*keys, *action_keys}, arrays.source)
         return _read(arrays, observations, actions, ends, action_bounds, clip_actions, action_space, on_invalid, storage)
+
+
+def _warn_of_images(arrays: Arrays, others: Collection[str], n_steps: int) -> None:
+    """Say which arrays are not read though they hold an image for each step."""
+    for name in sorted(set(arrays.names) - set(others), key=str):
+        shape, dtype = arrays.describe(name) or ((), None)
+        if dtype == np.uint8 and len(shape) == 4 and shape[0] == n_steps and {shape[1], shape[3]} & set(CHANNELS):
+            warnings.warn(
+                f"{arrays.source}: {name} has an image of shape {shape[1:]} for each step, and is not read. Call it "
+                f"{STORED_IMAGE}{name}, or name it in observation_keys=[...].",
+                stacklevel=4,
+            )
 
 
 class _Ends(NamedTuple):

@@ -1,5 +1,6 @@
 """Arrays in hdf5 files that nobody vouches for: checked before a byte of them is read."""
 
+import contextlib
 import math
 import zlib
 
@@ -74,6 +75,21 @@ def open_hdf5(
         if n_bytes and data.get_offset() is None:
             _check_chunks(data, shape, what)
     return data, shape, dtype
+
+
+def describe_hdf5(group: h5py.Group, name: str, where: str) -> tuple[tuple[int, ...], np.dtype] | None:
+    """
+    Return shape and type of an array that is not to be read, None where there is none in this file.
+
+    :param group: as for :func:`read_hdf5`
+    :param name: what may be an array there
+    :param where: the file, for messages
+    """
+    with contextlib.suppress(Exception):  # over damaged files h5py raises nearly everything
+        check_within(group, name, where)
+        data = h5py.h5d.open(group.id, name.encode())
+        return (data.shape, data.dtype) if _stored_within(data) else None
+    return None
 
 
 def check_within(group: h5py.Group, name: str, where: str) -> None:

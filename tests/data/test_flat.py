@@ -1,6 +1,8 @@
 """Flat arrays in one file: what is read, and what is refused."""
 
+import io
 import warnings
+import zipfile
 
 import gymnasium as gym
 import h5py
@@ -117,6 +119,41 @@ def test_other_names_and_chosen_observations(path):
     assert load_flat(path).observation_space.shape == (1,)
     both = load_flat(path, observation_keys=["keypoint", "state"])
     np.testing.assert_array_equal(both.observations, np.hstack([extra.reshape(N, 4), np.ones((N, 1))]))
+
+
+def hdf5(path, **changes):
+    path = path.with_suffix(".hdf5")
+    with h5py.File(path, "w") as file:
+        for name, array in arrays(**changes).items():
+            file[name] = array
+    return path
+
+
+@pytest.mark.parametrize("source", [write, hdf5, lambda path, **changes: arrays(**changes)], ids=["npz", "hdf5", "memory"])
+def test_images_of_another_name_are_told_of(source, path):
+    """Whatever they are called, but not what is read, chosen, known or no image of each step."""
+    frames = np.zeros((N, 6, 5, 3), np.uint8)
+    with pytest.warns(UserWarning, match=r"pixels has an image of shape \(6, 5, 3\) .*not read\. Call it image:pixels, or"):
+        assert load_dataset(source(path, pixels=frames)).image_spaces == {}
+    read = {"image:front": frames, "next_observations": frames, "short": frames[1:], "floats": frames / 255}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert list(load_dataset(source(path, **read)).image_spaces) == ["front"]
+        chosen = load_dataset(source(path, pixels=frames), observation_keys=["observations"])
+    assert chosen.image_spaces == {}
+
+
+def test_arrays_that_are_not_read_may_hold_anything(path):
+    """Neither memory nor Python is spent on them: a shape of 2**45 bytes, objects, and no array at all."""
+    write(path, objects=np.array([len, {}], dtype=object))
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"shape": (N, 2**20, 2**20, 3), "fortran_order": False, "descr": "|u1"})
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("huge.npy", header.getvalue())
+        archive.writestr("broken.npy", header.getvalue()[:9])
+        archive.writestr("notes.txt", "hello")
+    with pytest.warns(UserWarning, match="huge has an image of shape .1048576, 1048576, 3."):
+        assert len(load_dataset(path)) == N
 
 
 def test_bounds_of_actions(path):
