@@ -98,7 +98,7 @@ def load_lerobot(
         raise DatasetError(f"{source}: {INFO} tells of {n_episodes} episodes; there are {len(numbers)}.")
     if not {REWARD, SUCCESS} & set(labels):
         warn_of_made_up_rewards((), source)
-    wanted = range(len(numbers)) if episodes is None else [_place(number, numbers, source) for number in episodes]
+    wanted = range(len(numbers)) if episodes is None else _places(episodes, numbers, source)
     actions = columns[ACTION]
     if action_bounds is None and action_space is None:
         action_bounds = _recorded(actions)
@@ -205,11 +205,13 @@ def _rewards(labels: dict[str, np.ndarray], n_steps: int) -> tuple[np.ndarray, b
     return marks[: int(np.argmax(marks)) + 1 if marks.any() else n_steps].astype(float), bool(marks.any()), told
 
 
-def _place(number: int, numbers: np.ndarray, source: str) -> int:
-    found = np.flatnonzero(numbers == number)
-    if len(found) != 1:
-        raise DatasetError(f"{source}: there is no episode {number!r}, only {numbers[0]:g} to {numbers[-1]:g}.")
-    return int(found[0])
+def _places(episodes: Sequence[int], numbers: np.ndarray, source: str) -> list[int]:
+    """Return where some episodes are among the numbers of all."""
+    place_of = {number: place for place, number in enumerate(numbers.tolist())}
+    for number in episodes:
+        if number not in place_of:
+            raise DatasetError(f"{source}: there is no episode {number!r}, only {numbers[0]:g} to {numbers[-1]:g}.")
+    return [place_of[number] for number in episodes]
 
 
 def _recorded(actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

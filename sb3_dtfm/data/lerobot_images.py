@@ -94,9 +94,11 @@ class Cameras:
         source: str,
     ) -> None:
         self._folder, self._info, self._files, self._size, self._source = folder, info, files, size, source
+        self._stops = np.cumsum([n_rows for _, n_rows in files])  # of each file's rows among those of all
         self._shapes = {camera: _shape(info["features"][camera]["shape"], f"{source}: {camera}") for camera in cameras}
         self._videos = [camera for camera in cameras if info["features"][camera]["dtype"] == VIDEO]
         self._begins: Columns | None = None
+        self._rows_of: dict[float, list[int]] = {}  # by episode
         if not self._videos:
             return
         if not POSITIVE.accepts(info.get("fps")):
@@ -106,6 +108,8 @@ class Cameras:
             parts = ("chunk_index", "file_index", "from_timestamp")
             names = [EPISODE, *(f"videos/{camera}/{each}" for camera in self._videos for each in parts)]
             self._begins = Columns(folder, EPISODES, names, source)
+            for row, episode in enumerate(self._begins.numbers[EPISODE][:, 0].tolist()):
+                self._rows_of.setdefault(episode, []).append(row)
 
     @functools.cached_property
     def _image_files(self) -> set[Path]:
@@ -138,7 +142,12 @@ class Cameras:
             values["episode_chunk"] = episode // self._info.get("chunks_size", 1000)
         else:
             columns = self._begins.numbers
-            (row,) = np.flatnonzero(columns[EPISODE][:, 0] == episode)
+            rows = self._rows_of.get(episode, [])
+            if len(rows) != 1:
+                raise DatasetError(
+                    f"{self._source}, episode {episode}: {EPISODES} has {len(rows)} rows of it, expected one."
+                )
+            row = rows[0]
             values.update({name: int(columns[f"videos/{camera}/{name}"][row, 0]) for name in ("chunk_index", "file_index")})
             begin = float(columns[f"videos/{camera}/from_timestamp"][row, 0])
         template = self._info.get("video_path") or PATHS[version]
@@ -148,14 +157,15 @@ class Cameras:
 
     def _encoded(self, camera: str, rows: np.ndarray, where: str) -> list[bytes]:
         """The bytes of some images, whose batches are read one by one: a small file can tell of one image many times."""
-        pyarrow, start = import_pyarrow(self._source), 0
+        pyarrow = import_pyarrow(self._source)
         found: dict[int, Any] = {}
-        for path, n_rows in self._files:
-            here = rows[(rows >= start) & (rows < start + n_rows)] - start
-            if len(here):
-                with wrap_dataset_errors(f"{where}: {path}"), pyarrow.parquet.ParquetFile(path) as file:
-                    found.update((start + row, image) for row, image in _rows(file, camera, here))
-            start += n_rows
+        files = np.searchsorted(self._stops, rows, side="right")  # of each row
+        for number in np.unique(files):
+            path, n_rows = self._files[number]
+            start = int(self._stops[number]) - n_rows
+            with wrap_dataset_errors(f"{where}: {path}"), pyarrow.parquet.ParquetFile(path) as file:
+                here = _rows(file, camera, rows[files == number] - start)
+                found.update((start + row, image) for row, image in here)
         return [self._content(found[row], where) for row in rows.tolist()]
 
     def _content(self, image: Any, where: str) -> bytes:

@@ -1,6 +1,7 @@
 """LeRobot's folders: written as its formats 2.1 and 3.0 describe them."""
 
 import json
+import time
 
 import numpy as np
 import pyarrow as pa
@@ -10,6 +11,7 @@ from gymnasium import spaces
 
 from sb3_dtfm import DT
 from sb3_dtfm.data import DatasetError, load_dataset
+from sb3_dtfm.data.lerobot import _places
 
 LENGTHS = [3, 5, 4]
 
@@ -164,6 +166,13 @@ def test_some_of_the_episodes(version, tmp_path):
     np.testing.assert_array_equal(chosen.observations, np.r_[whole.observations[8:], whole.observations[:3]])
     with pytest.raises(DatasetError, match="arm: there is no episode 3, only 0 to 2"):
         load_dataset(path, episodes=[3])
+
+
+def test_the_time_to_find_episodes_grows_with_their_number_alone():
+    numbers = np.arange(200_000.0)
+    start = time.process_time()
+    assert _places(range(len(numbers)), numbers, "arm") == list(range(len(numbers)))
+    assert time.process_time() - start < 2.0
 
 
 def test_without_rewards_it_is_said_what_counts(tmp_path):

@@ -98,6 +98,30 @@ def test_a_step_sees_the_frame_of_its_time(version, kind, tmp_path):
     assert DT("MultiInputPolicy", dataset=small, device="cpu").policy.image_spaces[CAMERA].shape == (3, 12, 16)
 
 
+@pytest.mark.parametrize(("rows", "n_found"), [([0, 1], 0), ([0, 2, 1, 2], 2)])
+def test_each_episode_has_one_row_of_where_it_is_in_a_video(rows, n_found, tmp_path):
+    """In any order; others than the one that has none or several can be read."""
+    images = write(tmp_path / "arm", "v3.0")
+    path = tmp_path / "arm" / "meta" / "episodes" / "file-000.parquet"
+    pq.write_table(pq.read_table(path).take(rows), path)
+    with pytest.raises(DatasetError, match=f"arm, episode 2: meta/episodes has {n_found} rows of it, expected one"):
+        load_dataset(tmp_path / "arm")
+    found = load_dataset(tmp_path / "arm", episodes=[1]).own(CAMERA).numpy()
+    assert np.abs(found.astype(int) - images[3:9]).mean() < 4.0
+
+
+def test_steps_in_any_order_find_their_images(tmp_path):
+    """Also where an episode lies in several files."""
+    images = write(tmp_path / "arm", kind="image")
+    whole = pa.concat_tables(pq.read_table(tmp_path / "arm" / "data" / f"{number}.parquet") for number in range(3))
+    shuffled = whole.take(np.random.default_rng(0).permutation(len(whole)))
+    for number, (start, stop) in enumerate([(0, 5), (5, 6), (6, 13)]):
+        pq.write_table(
+            shuffled.slice(start, stop - start), tmp_path / "arm" / "data" / f"{number}.parquet", row_group_size=3
+        )
+    np.testing.assert_array_equal(load_dataset(tmp_path / "arm").own(CAMERA), images)
+
+
 def test_images_in_files_of_their_own(tmp_path):
     images = write(tmp_path / "arm", kind="image")
     path = tmp_path / "arm" / "data" / "1.parquet"
