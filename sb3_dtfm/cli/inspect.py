@@ -84,9 +84,10 @@ def _load_for(
 ) -> TrajectoryBuffer:
     env = gym.make(env_id, **env_kwargs)
     observed, action_space = env.observation_space, env.action_space
-    limit = None if env.spec is None else env.spec.max_episode_steps
+    known: dict[str, Any] = {"action_space": action_space, "observation_space": observed}
+    known["max_episode_steps"] = None if env.spec is None else env.spec.max_episode_steps
+    known["env_args"] = getattr(env.unwrapped, "env_args", None)
     env.close()
-    known = {"action_space": action_space, "observation_space": observed, "max_episode_steps": limit}
     buffer = load_dataset(dataset, **{**known, **options})
     buffer.check_task(env_id)
     flat, cameras = flatten_observation_space(without_images(observed)), image_spaces(observed)

@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_dtfm import DTFM
-from sb3_dtfm.cli import push, sweep
+from sb3_dtfm.cli import inspect, push, sweep
 from sb3_dtfm.data import DatasetError, load_dataset
 from sb3_dtfm.envs import ReturnToGoWrapper
 from sb3_dtfm.finetuning import FinetunedDTFM, ResidualActionVecEnv
@@ -92,6 +92,12 @@ def test_buffers_keep_the_controller(files, lift):
         make_model(DTFM, buffer, env=wrapped(lift))
     both = [{"dataset": files["common"]}, {"dataset": files["common"]}]
     assert load_dataset(both).controller["kp"] == 150
+
+
+def test_a_dataset_is_inspected_for_the_environment_s_own_controller(files):
+    assert inspect._load_for(LIFT, STIFF, str(files["stiff"]), {}).env_id == LIFT
+    with pytest.raises(DatasetError, match="kp is 150 instead of 300"):
+        inspect._load_for(LIFT, STIFF, str(files["common"]), {})
 
 
 def test_environments_of_fine_tuning_are_compared(path, lift, stiff):
