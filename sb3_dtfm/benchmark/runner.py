@@ -211,8 +211,9 @@ class Runner:
 
 
 def _bar(name: str, n_steps: int) -> tqdm:
-    """Gradient steps and the time to go; without a terminal it shows once a minute."""
-    return tqdm(desc=name, total=n_steps, leave=False, smoothing=0, mininterval=0.5 if sys.stderr.isatty() else 60.0)
+    """Gradient steps and the time to go; without a terminal it shows once a minute, during evaluations, too."""
+    interval = 0.5 if sys.stderr.isatty() else 60.0
+    return tqdm(desc=name, total=n_steps, leave=False, smoothing=0, miniters=0, mininterval=interval)
 
 
 def _say(message: str) -> None:
