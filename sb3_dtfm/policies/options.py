@@ -20,6 +20,9 @@ from sb3_dtfm.heads.base import NOISE_ROWS
 from sb3_dtfm.policies.images import EXTRACTORS
 from sb3_dtfm.policies.normalization import OBSERVATION_SCALINGS, RETURN_SCALINGS
 
+# N of best-of-N where a critic learns and no N is given.
+N_ACTION_SAMPLES = 8
+
 
 class Extractor:
     """The name of a class for images."""
@@ -82,7 +85,7 @@ class PolicyOptions(Options):
     :param gamma: discount of a step for the critic
     :param expectile: of the critic's value loss, in [0.5, 1)
     :param n_action_samples: N of best-of-N: actions, or chunks, that are sampled, of which the critic takes one; 1 asks
-        no critic
+        no critic. 8 where there is a critic, if not given
     :param sample_noise_std: standard deviation of the noise that all but the first of them start from; above 1, which the
         flow has learned, they differ more, and the critic has more to choose among
     :param temperature: how much chance that choice leaves, in units of how far actions' values spread in the data; 0, the
@@ -114,7 +117,7 @@ class PolicyOptions(Options):
     critic_steps: int = option(0, Number(low=0, whole=True))
     gamma: float = option(0.99, PROBABILITY_BELOW_1)
     expectile: float = option(0.7, Number(low=0.5, high=1, below_high=True))
-    n_action_samples: int = option(1, Number(low=1, high=NOISE_ROWS, whole=True), acting=True)
+    n_action_samples: int = option(None, Number(low=1, high=NOISE_ROWS, whole=True, optional=True), acting=True)
     sample_noise_std: float = option(1.0, POSITIVE, acting=True)
     temperature: float = option(0.0, NOT_NEGATIVE, acting=True)
     kv_cache: bool = option(False, BOOLEAN, acting=True)
@@ -127,6 +130,8 @@ class PolicyOptions(Options):
         n_action_steps = (self.chunk_size + 1) // 2 if self.n_action_steps is None else self.n_action_steps
         accepted = {"n_action_steps": Number(low=1, high=self.chunk_size, whole=True)}
         vars(self).update(check_arguments({"n_action_steps": n_action_steps}, accepted))
+        if self.n_action_samples is None:
+            vars(self)["n_action_samples"] = N_ACTION_SAMPLES if self.critic_steps else 1
         if self.n_action_samples > 1 and not self.critic_steps:
             raise ValueError(
                 f"n_action_samples={self.n_action_samples} needs a model that was trained with "

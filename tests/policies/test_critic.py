@@ -10,6 +10,7 @@ from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.files import ModelFileError
 from sb3_dtfm.policies.context import Context
 from sb3_dtfm.policies.critic import SAMPLE_STRIDE, Critic
+from sb3_dtfm.policies.options import PolicyOptions
 from tests.algorithms.small import make_model, record_curves
 
 SPACE = spaces.Box(-1.0, 1.0, (1,), np.float32)
@@ -270,3 +271,10 @@ def test_a_file_without_its_critic_is_refused(cheetah_buffer, tmp_path):
     plain = make_model(DTFM, cheetah_buffer).learn(1)
     with pytest.raises(ModelFileError, match="critic"):
         plain.set_parameters(str(tmp_path / "critic.zip"))
+
+
+@pytest.mark.parametrize(
+    ("given", "n_samples"), [({}, 1), ({"critic_steps": 1}, 8), ({"critic_steps": 1, "n_action_samples": 1}, 1)]
+)
+def test_a_critic_chooses_among_eight_samples_unless_told_otherwise(given, n_samples):
+    assert PolicyOptions(**given).n_action_samples == n_samples
