@@ -10,7 +10,6 @@ Initial states are those of final evaluations.
 import argparse
 import itertools
 
-import ogbench  # noqa: F401  (registers the tasks)
 import torch as th
 
 from sb3_dtfm import DTFM
@@ -26,6 +25,8 @@ def main() -> None:
     parser.add_argument("--temperatures", type=float, nargs="+", default=[0.0, 0.3], metavar="T")
     parser.add_argument("--episodes", type=int, default=100)
     options = parser.parse_args()
+    import ogbench  # noqa: F401  (registers the tasks)
+
     th.set_num_threads(1)
     model = DTFM.load(options.model, device="cpu")
     settings = {"env_wrapper": [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 0.0}}]}
