@@ -18,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 
 from go1.contexts import N_ENVS
+from go1.teachers import Drag
 from sb3_dtfm import DTFM
 from sb3_dtfm.envs import ReturnToGoWrapper
 from sb3_dtfm.envs.go1 import ENV_ID
@@ -78,13 +79,16 @@ def main() -> None:
     parser.add_argument("--onnx", metavar="FILE", required=True, help="the teacher")
     parser.add_argument("--student", metavar="FILE", help="model that acts; the teacher by default")
     parser.add_argument("--noise", type=float, default=0.0, help="on the actions carried out, share of the action range")
+    parser.add_argument("--drag", action="store_true", help="pull the robot, and hold it back or drive it on")
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--seed", type=int, default=11)
     options = parser.parse_args()
     recorders = [EpisodeRecorder(gym.make(ENV_ID)) for _ in range(min(N_ENVS, options.episodes))]
-    envs = [TwoObservers(ReturnToGoWrapper(recorder, target_return=0.0)) for recorder in recorders]
+    robots: list[gym.Env] = [Drag(recorder) if options.drag else recorder for recorder in recorders]
+    envs = [TwoObservers(ReturnToGoWrapper(robot, target_return=0.0)) for robot in robots]
     who = options.student or "the teacher"
-    about = f"re-recorded: {options.episodes} episodes of {who} with noise {options.noise:g}, labelled by {options.onnx}."
+    who += f" with noise {options.noise:g}{' and drag' if options.drag else ''}"
+    about = f"re-recorded: {options.episodes} episodes of {who}, labelled by {options.onnx}."
     metadata = {"algorithm_name": "OnnxAgent", "description": about, "ref_min_score": 0.0}
     metadata["num_episodes_average_score"] = options.episodes
     episodes = show_progress(labelled_episodes(envs, options), options.episodes, True)

@@ -8,6 +8,7 @@ Teachers that are disturbed in ways that `--noise` does not know, so that a velo
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from sb3_dtfm.envs.go1.env import TeacherObservation
@@ -26,28 +27,40 @@ class Restless(TeacherObservation):
         return super().step(action)
 
 
-class Dragged(TeacherObservation):
+class Drag(gym.Wrapper):
     """
-    A teacher whose robot is pulled along the floor, and held back or driven on, by forces that are drawn anew each 2 s on
-    average; it corrects its velocity.
+    Pulls the robot along the floor, and holds it back or drives it on, by forces that are drawn anew each 2 s on average.
+
+    :param env: Go1Velocity-v0
     """
 
     SHARE = 0.01  # of the steps that end a force
     PULL, DRAG = (-15.0, 15.0), (-20.0, 60.0)  # N, and N s/m
 
-    def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
-        observation, info = super().reset(**kwargs)
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        observation, info = self.env.reset(**kwargs)
         self._draw()
         return observation, info
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         env: Any = self.unwrapped
         if env.np_random.random() < self.SHARE:
             self._draw()
         data = env.simulation.data
         data.body(TRUNK).xfrc_applied[:2] = self._pull - self._drag * data.qvel[:2]
-        return super().step(action)
+        return self.env.step(action)
 
     def _draw(self) -> None:
         rng = self.unwrapped.np_random
         self._pull, self._drag = rng.uniform(*self.PULL, 2), rng.uniform(*self.DRAG)
+
+
+class Dragged(TeacherObservation):
+    """
+    A teacher whose robot is in :class:`Drag`; it corrects its velocity.
+
+    :param env: Go1Velocity-v0
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(Drag(env))

@@ -22,7 +22,7 @@ def test_actions_are_what_the_teacher_would_do_and_the_robot_feels_those_carried
         DTFM("MultiInputPolicy", dataset=[episode] * 2, context_length=3, batch_size=4, seed=0).save(
             tmp_path / "student.zip"
         )
-        arguments += ["--student", str(tmp_path / "student.zip")]
+        arguments += ["--student", str(tmp_path / "student.zip"), "--drag"]
     monkeypatch.setattr(labelled, "N_ENVS", 2)
     monkeypatch.setattr("sys.argv", ["labelled", *arguments, "--noise", "0.5"])
     labelled.main()

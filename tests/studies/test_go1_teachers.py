@@ -3,13 +3,13 @@
 import itertools
 
 import numpy as np
-from go1.teachers import Dragged, Restless
+from go1.teachers import Drag, Dragged, Restless
 
 from sb3_dtfm.envs.go1.env import Go1Env
 
 
 def test_a_dragged_robot_feels_its_forces_along_the_floor_and_a_new_episode_none_before_its_first_step():
-    env = Dragged(Go1Env(randomize=False))
+    env = Drag(Go1Env(randomize=False))
     env.reset(seed=0)
     data = env.unwrapped.simulation.data
     pulls = set()
@@ -24,12 +24,15 @@ def test_a_dragged_robot_feels_its_forces_along_the_floor_and_a_new_episode_none
     assert all(-20.0 <= drag <= 60.0 for drag in pulls)
     env.reset(seed=0)
     np.testing.assert_array_equal(data.body("trunk").xfrc_applied, 0.0)
+    teacher = Dragged(Go1Env(randomize=False))
+    assert teacher.reset(seed=0)[0].shape == (48,)
+    assert isinstance(teacher.env, Drag)
 
 
 def test_a_robot_that_is_held_back_moves_less():
     moved = []
     for drag in (0.0, 200.0):
-        env = Dragged(Go1Env(randomize=False))
+        env = Drag(Go1Env(randomize=False))
         env.reset(seed=0)
         env.SHARE, env._pull, env._drag = 0.0, np.array([40.0, 0.0]), drag
         for _ in range(10):
