@@ -130,8 +130,8 @@ class PolicyOptions(Options):
         n_action_steps = (self.chunk_size + 1) // 2 if self.n_action_steps is None else self.n_action_steps
         accepted = {"n_action_steps": Number(low=1, high=self.chunk_size, whole=True)}
         vars(self).update(check_arguments({"n_action_steps": n_action_steps}, accepted))
-        if self.n_action_samples is None:
-            vars(self)["n_action_samples"] = N_ACTION_SAMPLES if self.critic_steps else 1
+        default = N_ACTION_SAMPLES if self.critic_steps else 1
+        vars(self)["n_action_samples"] = default if self.n_action_samples is None else self.n_action_samples
         if self.n_action_samples > 1 and not self.critic_steps:
             raise ValueError(
                 f"n_action_samples={self.n_action_samples} needs a model that was trained with "
