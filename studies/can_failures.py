@@ -1,5 +1,5 @@
 """
-Ends of trained models' attempts at Can that fail, to be looked at before a cure is chosen.
+Ends of trained models' episodes of Can that fail, to be looked at before a cure is chosen.
 
     python studies/can_failures.py logs/dtfm/robosuite-Can-v0_1/robosuite-Can-v0.zip ...
 

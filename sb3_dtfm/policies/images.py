@@ -25,8 +25,8 @@ class ResidualExtractor(BaseFeaturesExtractor):
     A residual network with group normalisation and spatial softmax (Levine et al., 2016), which learns where things are on
     random crops, as in robomimic (Mandlekar et al., 2021) and Diffusion Policy (Chi et al., 2023). Acting crops the centre.
 
-    The first convolution strides by 4, as NatureCNN's: in the same seconds on a CPU, it locates objects of Push-T with half
-    of the error of a stride of 2.
+    The first convolution strides by 4, as NatureCNN's, since a stride of 2 learned less in the same seconds on a CPU (one
+    run each, docs/studies/images.md).
 
     :param observation_space: Box (channels, height, width)
     :param features_dim: numbers that an image becomes

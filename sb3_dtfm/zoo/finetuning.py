@@ -110,7 +110,8 @@ def keep_one_action(policy: SequencePolicy, residual: bool) -> None:
         print(f"n_action_steps={policy.options.n_action_steps} becomes 1: a residual action is added to each action")
         policy.set_acting(n_action_steps=1)
     if policy.options.n_action_samples > 1:
-        print(f"n_action_samples={policy.options.n_action_samples} becomes 1: the online algorithm chooses the noise")
+        why = "a residual action is added to one sample" if residual else "the online algorithm chooses the noise"
+        print(f"n_action_samples={policy.options.n_action_samples} becomes 1: {why}")
         policy.set_acting(n_action_samples=1)
 
 
