@@ -18,7 +18,7 @@ import gymnasium as gym
 import numpy as np
 
 from go1.contexts import N_ENVS
-from go1.teachers import Drag
+from go1.teachers import Damping, Drag
 from sb3_dtfm import DTFM
 from sb3_dtfm.envs import ReturnToGoWrapper
 from sb3_dtfm.envs.go1 import ENV_ID
@@ -80,14 +80,18 @@ def main() -> None:
     parser.add_argument("--student", metavar="FILE", help="model that acts; the teacher by default")
     parser.add_argument("--noise", type=float, default=0.0, help="on the actions carried out, share of the action range")
     parser.add_argument("--drag", action="store_true", help="pull the robot, and hold it back or drive it on")
+    parser.add_argument("--damping", action="store_true", help="joints that resist motion more")
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--seed", type=int, default=11)
     options = parser.parse_args()
     recorders = [EpisodeRecorder(gym.make(ENV_ID)) for _ in range(min(N_ENVS, options.episodes))]
-    robots: list[gym.Env] = [Drag(recorder) if options.drag else recorder for recorder in recorders]
+    disturbances = [wrapper for wrapper, is_asked in ((Drag, options.drag), (Damping, options.damping)) if is_asked]
+    robots: list[gym.Env] = [*recorders]
+    for wrapper in disturbances:
+        robots = [wrapper(robot) for robot in robots]
     envs = [TwoObservers(ReturnToGoWrapper(robot, target_return=0.0)) for robot in robots]
     who = options.student or "the teacher"
-    who += f" with noise {options.noise:g}{' and drag' if options.drag else ''}"
+    who += " with " + " and ".join((f"noise {options.noise:g}", *(each.__name__.lower() for each in disturbances)))
     about = f"re-recorded: {options.episodes} episodes of {who}, labelled by {options.onnx}."
     metadata = {"algorithm_name": "OnnxAgent", "description": about, "ref_min_score": 0.0}
     metadata["num_episodes_average_score"] = options.episodes

@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_dtfm.envs.go1.env import TeacherObservation
-from sb3_dtfm.envs.go1.model import TRUNK
+from sb3_dtfm.envs.go1.model import JOINT_NAMES, KD, TRUNK
 
 
 class Restless(TeacherObservation):
@@ -53,6 +53,24 @@ class Drag(gym.Wrapper):
     def _draw(self) -> None:
         rng = self.unwrapped.np_random
         self._pull, self._drag = rng.uniform(*self.PULL, 2), rng.uniform(*self.DRAG)
+
+
+class Damping(gym.Wrapper):
+    """
+    Joints that resist motion more than those of our model, by a factor that an episode draws.
+
+    :param env: Go1Velocity-v0 with our model
+    """
+
+    RANGE = (1.0, 4.0)
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        observation, info = self.env.reset(**kwargs)
+        env: Any = self.unwrapped
+        model = env.simulation.model
+        joints = [model.joint(name).id for name in JOINT_NAMES]
+        model.dof_damping[model.jnt_dofadr[joints]] = KD * env.np_random.uniform(*self.RANGE)
+        return observation, info
 
 
 class Dragged(TeacherObservation):

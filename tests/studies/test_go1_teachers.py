@@ -3,7 +3,7 @@
 import itertools
 
 import numpy as np
-from go1.teachers import Drag, Dragged, Restless
+from go1.teachers import Damping, Drag, Dragged, Restless
 
 from sb3_dtfm.envs.go1.env import Go1Env
 
@@ -39,6 +39,20 @@ def test_a_robot_that_is_held_back_moves_less():
             env.step(np.zeros(12, np.float32))
         moved.append(env.unwrapped.simulation.data.qvel[0])
     assert moved[0] > 2 * moved[1] > 0.0
+
+
+def test_damping_is_drawn_anew_in_each_episode_for_all_joints_alike():
+    env = Damping(Go1Env(randomize=False))
+    model, seen = env.unwrapped.simulation.model, []
+    made = model.dof_damping.copy()
+    for seed in (0, 1, 0):
+        env.reset(seed=seed)
+        np.testing.assert_array_equal(model.dof_damping[:6], made[:6])
+        factors = model.dof_damping[6:] / made[6:]
+        np.testing.assert_allclose(factors, factors[0])
+        assert 1.0 <= factors[0] <= 4.0
+        seen.append(factors[0])
+    assert seen[0] == seen[2] != seen[1]
 
 
 def test_restless_commands_hold_half_a_second():
