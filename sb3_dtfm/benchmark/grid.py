@@ -49,7 +49,6 @@ ENTRY: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "target_return": ("a number", lambda value: type(value) in (float, int)),
     "recorded_from": ("a text", _is_text),
     "env_kwargs": ("a mapping", _is_mapping),
-    "env_wrapper": ("a wrapper or a list of them", lambda value: isinstance(value, str | dict | list)),
     "dataset_kwargs": ("a mapping", _is_mapping),
     "fraction": ("a number in (0, 1]", _is_share),
     "gym_packages": ("a list of modules", lambda value: isinstance(value, list) and all(map(_is_text, value))),

@@ -11,7 +11,7 @@ import yaml
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.rows import BASELINES
-from sb3_dtfm.zoo.arguments import UsageError, find_target_return, with_target_return
+from sb3_dtfm.zoo.arguments import UsageError, with_target_return
 from sb3_dtfm.zoo.registration import packaged_config, policy_of, with_policy_options
 
 PROFILES = {"default": None, "paper": "paper"}
@@ -39,7 +39,6 @@ class Task(NamedTuple):
     :param recorded_from: the agent or demonstrator, None for what the dataset's metadata say
     :param task: Gymnasium id, None where the name is it
     :param env_kwargs: of `gymnasium.make`, beside the profile's
-    :param env_wrapper: wrappers as in RL-Zoo's YAML, None for the profile's; a ReturnToGoWrapper follows
     :param dataset_kwargs: of :func:`~sb3_dtfm.data.load_dataset`, beside the profile's
     :param fraction: share of the dataset's episodes, in (0, 1], that counts as all of them
     :param gym_packages: modules that register the task
@@ -53,7 +52,6 @@ class Task(NamedTuple):
     recorded_from: str | None = None
     task: str | None = None
     env_kwargs: Mapping[str, Any] = MappingProxyType({})
-    env_wrapper: str | dict[str, Any] | list[Any] | None = None
     dataset_kwargs: Mapping[str, Any] = MappingProxyType({})
     fraction: float = 1.0
     gym_packages: Sequence[str] = ()
@@ -127,9 +125,6 @@ def task_settings(
     :raises UsageError: settings missing, unknown or not allowed here
     """
     settings = read_profile(profile, algo, task.env_id)
-    if task.env_wrapper is not None:
-        target_return = find_target_return(settings.get("env_wrapper"))
-        settings["env_wrapper"] = with_target_return(target_return, task.env_wrapper)
     if task.dataset is not None and "dataset" in settings:  # to which the target return belongs
         settings["env_wrapper"] = with_target_return(None, settings.get("env_wrapper"))
     hyperparams = with_policy_options(hyperparams)

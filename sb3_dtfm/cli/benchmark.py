@@ -22,7 +22,6 @@ The file of --datasets maps a task to its dataset, or to some of these keys:
   target_return   in reward units; what `sb3-dtfm inspect` suggests of the dataset by default
   recorded_from   the agent or demonstrator, for the report
   env_kwargs      of the environment
-  env_wrapper     wrappers of the environment, as in RL-Zoo's YAML files; a ReturnToGoWrapper follows
   dataset_kwargs  of the dataset's reader: clip_actions, action_bounds and others
   fraction        share of the dataset's episodes that the entry consists of, in (0, 1]
   gym_packages    modules to import first: they register the task

@@ -254,7 +254,6 @@ ENTRIES = {
         "dataset": DATASET_ID,
         "task": TASK,
         "env_kwargs": {"max_episode_steps": 20, "ctrl_cost_weight": 0.2},
-        "env_wrapper": {"gymnasium.wrappers.ClipReward": {"max_reward": 5.0}},
         "dataset_kwargs": {"on_invalid": "drop"},
         "fraction": 0.67,
         "algorithms": ["bc", "dt"],
@@ -285,11 +284,6 @@ def test_several_data_sets_of_a_task_are_told_apart_by_their_names(suite):
     assert {job.data["n_steps"] for job in some} == {40}, "up to the time limit"
     assert {job.settings["env_kwargs"]["ctrl_cost_weight"] for job in some} == {0.2}
     assert {job.settings["dataset_kwargs"]["on_invalid"] for job in some} == {"drop"}
-    own, return_to_go = some[0].settings["env_wrapper"]
-    assert own == ENTRIES["some"]["env_wrapper"]
-    assert find_target_return([return_to_go]) == suggested_target_return(
-        load_dataset(DATASET_ID, max_episode_steps=20).random_fraction(0.67, 0)
-    )
 
 
 def test_what_the_command_says_of_data_and_environment_goes_before_the_entry_key_by_key(suite):
@@ -345,7 +339,6 @@ def test_a_suite_with_behaviour_cloning_runs_is_not_run_again_and_makes_a_report
         ({"fraction": 2}, "mine, fraction: expected a number in (0, 1], got 2."),
         ({"algorithms": ["td3"]}, "mine, algorithms: expected a list of dt, dtfm, bc, bc-best, got ['td3']."),
         ({"env_kwargs": 3}, "mine, env_kwargs: expected a mapping, got 3."),
-        ({"env_wrapper": 3}, "mine, env_wrapper: expected a wrapper or a list of them, got 3."),
         ({"target_return": "much"}, "mine, target_return: expected a number, got 'much'."),
         ({"chosen_with": "yes"}, "mine, chosen_with: expected true or false, got 'yes'."),
         ({"gym_packages": ["no_such_module"]}, "mine, gym_packages: no_such_module: No module named"),
