@@ -98,8 +98,13 @@ class Recorder:
         self.agents, self.data = shared / "agents", shared / "data"
         self.minari = Path(os.environ.get("MINARI_DATASETS_PATH", Path.home() / ".minari/datasets"))
 
+    def adroit(self, dataset_id: str, task: str, episodes: int, *options: str) -> None:
+        """Sampled episodes of a hand's agent with the published reward."""
+        chosen = ["--stochastic", "--gym-packages", "adroit_tasks", "--env", f"{task}Published-v1"]
+        self.agent(dataset_id, "ppo", f"{task}-v1", episodes, *chosen, *options)
+
     def agent(self, dataset_id: str, model: str, env_id: str, episodes: int, *options: str) -> None:
-        """Episodes of an agent, one of `agents/` or one that is trained here first."""
+        """Episodes of an agent, one of `agents/` or one that is trained here first; options may name another environment."""
         if (self.minari / dataset_id).exists():
             return
         path = self.agents / f"{model}-{env_id}.zip"
@@ -155,11 +160,11 @@ class Recorder:
 
     def door(self) -> None:
         """Adroit's door by people, alone and with ten episodes of a noisy agent."""
-        human, mixed = DATASETS / "door_human.npz", DATASETS / "door_mixed.npz"
+        human, mixed = DATASETS / "door_human.npz", DATASETS / "door_mixed_published.npz"
         if not human.exists():
             human.write_bytes((self.data / "adroit-door/door_human.npz").read_bytes())
-        part = "local/adroit/door-noisy-v0"
-        self.agent(part, "ppo", "AdroitHandDoor-v1", 10, "--stochastic", "--noise", "0.1")
+        part = "local/adroit/door-noisy-v1"
+        self.adroit(part, "AdroitHandDoor", 10, "--noise", "0.1")
         if not mixed.exists():
             from sb3_dtfm.data import load_dataset
 
@@ -217,15 +222,15 @@ def steps(recorder: Recorder) -> dict[str, Callable[[], None]]:
         "maze-planned": r.planned,
         "stack": lambda: r.demonstrations("stack", "stack", 50),
         "square": lambda: r.demonstrations("square", "square", 200),
-        "adroit-hammer": lambda: r.agent("local/adroit/hammer-v0", "ppo", "AdroitHandHammer-v1", 25, sampled),
+        "adroit-hammer": lambda: r.adroit("local/adroit/hammer-v1", "AdroitHandHammer", 25),
         "adroit-pen": lambda: r.agent("local/adroit/pen-v0", "ppo", "AdroitHandPen-v1", 50, sampled),
-        "adroit-relocate": lambda: r.agent("local/adroit/relocate-v0", "ppo", "AdroitHandRelocate-v1", 25, sampled),
+        "adroit-relocate": lambda: r.adroit("local/adroit/relocate-v1", "AdroitHandRelocate", 25),
     }
 
 
 def run(command: list[str]) -> None:
     print(" ".join(command), flush=True)
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(("studies", *sys.path[1:]))}
     subprocess.run(command, check=True, env=environment, stdout=subprocess.DEVNULL)
 
 
