@@ -31,9 +31,11 @@ def as_numbers(values: Any, where: str) -> np.ndarray:
     :param values: a pyarrow Array whose entries are numbers, or lists of as many
     :param where: the file and the column, for messages
     :return: (N, .)
-    :raises DatasetError: lists of several lengths, or no numbers
+    :raises DatasetError: no rows, lists of several lengths, or no numbers
     """
     n_rows = len(values)
+    if not n_rows:
+        raise DatasetError(f"{where} has no rows; a row for each step is expected.")
     pyarrow = import_pyarrow(where)
     if pyarrow.types.is_list(values.type) or pyarrow.types.is_fixed_size_list(values.type):
         sizes = np.unique(np.diff(values.offsets.to_numpy())) if pyarrow.types.is_list(values.type) else np.zeros(1)

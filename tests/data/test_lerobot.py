@@ -128,7 +128,11 @@ def test_damaged_files(tmp_path):
     pq.write_table(pa.table({"action": [[1.0], [1.0, 2.0]]}), file)
     with pytest.raises(DatasetError, match=r"file-000.parquet: has no column episode_index, frame_index, observation"):
         load_dataset(path)
-    table = pq.read_table(pa.BufferReader(content)).drop_columns("action")
+    whole = pq.read_table(pa.BufferReader(content))
+    pq.write_table(whole.slice(0, 0), file)
+    with pytest.raises(DatasetError, match=r"file-000.parquet: [a-z_.]+ has no rows; a row for each step is expected"):
+        load_dataset(path)
+    table = whole.drop_columns("action")
     pq.write_table(table.append_column("action", [[[1.0]] * 11 + [[1.0, 2.0]]]), file)
     with pytest.raises(DatasetError, match=r"action holds lists of 1 to 2 numbers; one length is expected"):
         load_dataset(path)
