@@ -100,14 +100,15 @@ class Recorder:
 
     def adroit(self, dataset_id: str, task: str, episodes: int, *options: str) -> None:
         """Sampled episodes of a hand's agent with the published reward."""
-        chosen = ["--stochastic", "--gym-packages", "adroit_tasks", "--env", f"{task}Published-v1"]
-        self.agent(dataset_id, "ppo", f"{task}-v1", episodes, *chosen, *options)
+        self.agent(
+            dataset_id, "ppo", f"{task}Published-v1", episodes, "--stochastic", "--gym-packages", "adroit_tasks", *options
+        )
 
     def agent(self, dataset_id: str, model: str, env_id: str, episodes: int, *options: str) -> None:
-        """Episodes of an agent, one of `agents/` or one that is trained here first; options may name another environment."""
+        """Episodes of an agent, one of `agents/` or one that is trained here first."""
         if (self.minari / dataset_id).exists():
             return
-        path = self.agents / f"{model}-{env_id}.zip"
+        path = self.agents / f"{model}-{env_id.replace('Published', '')}.zip"
         if not path.exists():
             base = next(name for name in TRAINED if model.startswith(name))
             path = AGENTS / f"{model}.zip"
@@ -230,7 +231,11 @@ def steps(recorder: Recorder) -> dict[str, Callable[[], None]]:
 
 def run(command: list[str]) -> None:
     print(" ".join(command), flush=True)
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(("studies", *sys.path[1:]))}
+    environment = {
+        **os.environ,
+        "OMP_NUM_THREADS": "1",
+        "PYTHONPATH": f"studies{os.pathsep}{os.environ.get('PYTHONPATH', '')}",
+    }
     subprocess.run(command, check=True, env=environment, stdout=subprocess.DEVNULL)
 
 
