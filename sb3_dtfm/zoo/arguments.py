@@ -16,7 +16,7 @@ from sb3_dtfm.envs.packages import import_packages
 from sb3_dtfm.envs.return_to_go import check_target_return
 from sb3_dtfm.files import CLASSES, EVALUATED, check_settings, literal
 from sb3_dtfm.finetuning import FINETUNED
-from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, is_packaged, packaged_config
+from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, is_packaged, online_config, packaged_config
 
 # In a run's settings.
 WRAPPER = "sb3_dtfm.envs.ReturnToGoWrapper"
@@ -285,6 +285,8 @@ def train_arguments(argv: Sequence[str]) -> list[str]:
     conf_file = options.conf_file
     if options.algo in ALGORITHMS and conf_file in PACKAGED_CONFIGS:
         conf_file = str(packaged_config(options.algo, conf_file))
+    elif conf_file is None:
+        conf_file = online_config(options.algo, options.env)
     shorthands = _shorthands(options, {**_listed(conf_file, options.env), **given})
     if options.algo not in ALGORITHMS and shorthands:
         names = ", ".join(option for option, _ in shorthands)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import optuna
+import yaml
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
 
@@ -44,6 +45,17 @@ def packaged_config(algo: str, name: str | None = None) -> Path:
     folder = resources.files(PACKAGED_CONFIGS[name])
     own = Path(str(folder.joinpath(f"{algo}.yml")))
     return own if own.is_file() else Path(str(folder.joinpath("dt.yml")))
+
+
+def online_config(algo: str, env_id: str) -> str | None:
+    """
+    Hyperparameter file that comes with the package for a task of its own, which RL-Zoo does not list.
+
+    :param algo: RL-Zoo's name of an online algorithm
+    :return: None where there is none
+    """
+    path = Path(str(resources.files(PACKAGED_CONFIGS[None]).joinpath(f"{algo}.yml")))
+    return str(path) if path.is_file() and env_id in yaml.safe_load(path.read_text()) else None
 
 
 def is_packaged(path: str) -> bool:

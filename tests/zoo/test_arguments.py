@@ -2,6 +2,7 @@
 
 import argparse
 import ast
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -48,6 +49,14 @@ def test_any_other_conf_file_stays():
     assert zoo_reads(train_arguments(["--algo", "dtfm", "--conf-file=mine.yml"])).conf_file == "mine.yml"
     assert zoo_reads(train_arguments(["--algo", "sac"])).conf_file is None
     assert zoo_reads(train_arguments(["--algo", "sac", "--conf-file", "small"])).conf_file == "small"
+
+
+def test_ppo_on_a_task_of_this_package_has_packaged_settings():
+    task = ["--algo", "ppo", "--env", "Go1Velocity-v0"]
+    assert Path(zoo_reads(train_arguments(task)).conf_file) == packaged_config("dt").with_name("ppo.yml")
+    assert zoo_reads(train_arguments([*task, "--conf-file", "mine.yml"])).conf_file == "mine.yml"
+    assert zoo_reads(train_arguments(["--algo", "ppo", *ENV])).conf_file is None
+    assert zoo_reads(train_arguments(["--algo", "sac", *task[2:]])).conf_file is None
 
 
 def test_shorthands_join_the_users_hyperparameters():
