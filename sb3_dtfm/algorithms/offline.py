@@ -54,6 +54,8 @@ SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineAlgorithm")
 DECIDED = {"batch_size", "return_weighting"}
 # Episodes that a message shows at most.
 N_EPISODES_SHOWN = 50
+# Windows of which `train/best_of_n_share` is measured: with 32 samples of each, a whole batch took 9 % of the training time.
+N_SHARE_WINDOWS = 64
 
 
 class OfflineAlgorithm(SequenceModel):
@@ -492,7 +494,8 @@ class OfflineAlgorithm(SequenceModel):
             self.logger.record(f"train/{name}", mean)
         self.logger.record("train/action_mse", self._on_training_windows(self.policy.action_mse))
         if self.policy.options.n_action_samples > 1:
-            self.logger.record("train/best_of_n_share", self._on_training_windows(self.policy.best_of_n_share))
+            share = self._on_training_windows(self.policy.best_of_n_share, N_SHARE_WINDOWS)
+            self.logger.record("train/best_of_n_share", share)
         self.logger.record("train/learning_rate", self._current_learning_rate)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("time/steps_per_second", self._timed_steps / self._training_seconds)
@@ -500,8 +503,11 @@ class OfflineAlgorithm(SequenceModel):
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(step=self.num_timesteps)
 
-    def _on_training_windows(self, measure: Callable[[Windows, th.Generator], th.Tensor]) -> float:
+    def _on_training_windows(
+        self, measure: Callable[[Windows, th.Generator], th.Tensor], at_most: int | None = None
+    ) -> float:
         """Something measured on windows of the training data that belong to the step, so that it disturbs nothing."""
         assert self.buffer is not None
         generator = th.Generator(self.device).manual_seed(self.num_timesteps)
-        return float(measure(self.buffer.sample(self.batch_size, self.context_length, generator), generator))
+        n_windows = min(self.batch_size, at_most or self.batch_size)
+        return float(measure(self.buffer.sample(n_windows, self.context_length, generator), generator))
