@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
+from grasps import Counts, count
 from play import is_visible, join, load, record
 from relabel import flat
 
@@ -43,6 +44,16 @@ def test_solved_steps_are_terminal_and_the_last_step_gives_no_transition(tmp_pat
         if mask
     ]
     assert told == [(0, -1, 1), (1, 0, 0), (2, 0, 0), (4, -1, 1), (5, -1, 1), (6, -1, 1), (7, 0, 0)]
+
+
+def test_grasps_are_counted_when_they_begin():
+    # Up, down at the cube for two steps, lifting it, and down elsewhere twice.
+    grippers = np.array([[0, 0, 0.2], [0, 0, 0.02], [0, 0, 0.02], [0, 0, 0.1], [0.2, 0, 0.03], [0, 0, 0.2], [0.1, 0, 0.02]])
+    cubes = np.array([[0, 0, 0.02]] * 3 + [[0, 0, 0.1]] + [[0, 0, 0.02]] * 3)
+    assert count(grippers[:, None], cubes[:, None]) == Counts(at_cube=1, elsewhere=2, lifts=1)
+    grippers, cubes = (np.stack([each, each[::-1]], axis=1) for each in (grippers, cubes))
+    # Backwards, the second episode begins down elsewhere, which is no beginning.
+    assert count(grippers, cubes) == Counts(at_cube=2, elsewhere=3, lifts=2)
 
 
 @pytest.mark.parametrize(
