@@ -69,7 +69,7 @@ def _parser() -> argparse.ArgumentParser:
     argument = parser.add_argument
     argument("--model", required=True, type=Path, help="zip file of a DTFM, or folder of its run of `train`")
     argument("--algo", default="sac", help="dtfm, sac, tqc or ppo, or with a --conf-file a2c or trpo; sac by default")
-    argument("--target-return", type=float, help="in reward units; as in the model's run by default")
+    argument("--target-return", type=float, help="in reward units; the model's by default")
     argument("-conf", "--conf-file", help="the packaged settings if not given, else a YAML file or a Python package")
     every = "timesteps between two evaluations; by default a tenth of all: steps with dtfm, else decisions"
     argument("--eval-freq", type=int, metavar="N", help=every)

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_dtfm.algorithms import DTFM
 from sb3_dtfm.arguments import with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
-from sb3_dtfm.files import read_run
+from sb3_dtfm.files import read_configuration, read_run
 from sb3_dtfm.finetuning import FINETUNED, FinetunedDTFM, NoiseActionVecEnv, OnlineDTFM, ResidualActionVecEnv
 from sb3_dtfm.finetuning.noise_env import NOISE_SPACE_FLOW_STEPS
 from sb3_dtfm.finetuning.online import ACCEPTED
@@ -120,7 +120,7 @@ class FinetuningManager(OfflineExperimentManager):
     RL-Zoo's own manager, for what goes on from a DTFM in the environment of that DTFM's run.
 
     :param base: file of the DTFM, or folder of its run
-    :param target_return: environment reward units; by default as in that run
+    :param target_return: environment reward units; by default as in that run, or what the file tells
     :param evaluations_of_a_run: after equal shares of the timesteps; None where `eval_freq` says how often
     """
 
@@ -154,12 +154,14 @@ class FinetuningManager(OfflineExperimentManager):
         from_the_run += self.of_the_data
         hyperparams = {**{key: known[key] for key in from_the_run if known.get(key)}, **hyperparams}
         self.evaluate_alike(hyperparams)
-        if self.target_return is not None:
-            hyperparams["env_wrapper"] = with_target_return(self.target_return, hyperparams.get("env_wrapper"))
+        target_return = self.target_return
+        if target_return is None and not hyperparams.get("env_wrapper"):
+            target_return = read_configuration(self.base_file)["attributes"].get("target_return")
+        if target_return is not None:
+            hyperparams["env_wrapper"] = with_target_return(target_return, hyperparams.get("env_wrapper"))
         if not hyperparams.get("env_wrapper"):
             raise UsageError(
-                f"--target-return R: needed, as {self.base} does not hold the target return of its training; "
-                "`sb3-dtfm inspect DATASET` suggests one."
+                f"--target-return R: needed, as {self.base} was saved without one; `sb3-dtfm inspect DATASET` suggests one."
             )
         if self.evaluations_of_a_run is not None:
             n_timesteps = self.n_timesteps if self.n_timesteps > 0 else hyperparams["n_timesteps"]

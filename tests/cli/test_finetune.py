@@ -77,6 +77,16 @@ def test_a_run_is_finetuned_and_played(run, workplace, capsys):
     assert load_dataset("local/finetuned-v0").episode_lengths.tolist() == [20, 20]
 
 
+def test_a_file_without_a_run_tells_its_target_return(run, workplace):
+    (workplace / "alone.zip").write_bytes((run / "HalfCheetah-v5.zip").read_bytes())
+    steps = ["--env-kwargs", "max_episode_steps:20"]
+    assert main([*FINETUNE, "--model", "alone.zip", *steps, "-params", *QUICK]) == 0
+    settings = yaml.unsafe_load((workplace / "logs/finetuned/HalfCheetah-v5_1/HalfCheetah-v5/config.yml").read_text())
+    told = DTFM.load("alone").target_return
+    assert settings["env_wrapper"] == [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": told}}]
+    assert told == 20000
+
+
 def test_the_curve_begins_at_the_offline_policys_score(run, workplace):
     """The steps before the algorithm learns are evaluated as the model that was given, and so is the best model there."""
     assert main([*FINETUNE, "--model", str(run), "-params", *QUICK, "learning_starts:100"]) == 0
@@ -267,12 +277,14 @@ def test_the_online_algorithm_goes_on_learning(run, workplace, algorithm, quick)
 def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
     assert main(tiny_training("dt", "dataset:" + repr(DATASET_ID))) == 0
     (workplace / "alone.zip").write_bytes((run / "HalfCheetah-v5.zip").read_bytes())
+    untold = DTFM.load("alone")
+    untold.target_return = None
+    untold.save("untold")
     wrong = "vec_env_wrapper:['stable_baselines3.common.vec_env.VecMonitor']"
     cases = {
         "--model nowhere": "nowhere does not exist; --model names a DTFM's zip file or its run's folder.",
         "--model logs/dt/HalfCheetah-v5_1": "was saved by 'DT', not by DTFM.",
-        "--model alone.zip": "--target-return R: needed, as alone.zip does not hold the target return of its training; "
-        "`sb3-dtfm inspect DATASET` suggests one.",
+        "--model untold.zip": "--target-return R: needed, as untold.zip was saved without one; `sb3-dtfm inspect DATASET` ",
         f"--model {run} --algo td3": "--algo td3: no packaged settings; those of dtfm, ppo, sac, tqc are.",
         "--model alone.zip --algo dtfm --target-return 3": "dataset:...: needed, as alone.zip does not tell what it learned",
         f"--model {run} --algo dtfm -params n_episods:3": "n_episods (did you mean n_episodes?): no hyperparameter of",
