@@ -84,6 +84,11 @@ def is_mapping(dataset: Any) -> bool:
     return isinstance(dataset, Mapping)
 
 
+def holds_episodes(arrays: Mapping[str, Any]) -> bool:
+    """Return whether arrays number their episodes, as those of one episode do not."""
+    return any(np.size(arrays[name]) > 1 for name in (ENDS, LENGTHS, *EPISODES) if name in arrays)
+
+
 def fingerprint_flat_file(path: str | os.PathLike[str], options: dict[str, Any]) -> Fingerprint:
     """
     Take the fingerprint of a file as it is now.

@@ -67,10 +67,16 @@ def _is_step(found: Any) -> bool:
 
 def _n_axes(found: Any) -> int:
     """Count the axes of an array or of nested lists; lists of different lengths count as a whole episode."""
+    shape = _shape(found)
+    return 2 if shape is None else len(shape)
+
+
+def _shape(found: Any) -> tuple[int, ...] | None:
+    """Return the shape of an array or of nested lists; None for lists of different lengths."""
     try:
-        return np.ndim(found)
+        return np.shape(found)
     except ValueError:
-        return 2
+        return None
 
 
 def _parts(step: Sequence[Any]) -> list[Any]:
@@ -132,9 +138,9 @@ def _named(step: Sequence[Any]) -> dict[str, Any]:
     names: tuple[str, ...] = SHORT_STEP
     if len(parts) == len(STEP):
         # Of observations that are numbers, only the types tell a reward and a flag from two flags.
-        told_apart = np.ndim(step[0]) > 0 or type(step[3]) is not type(step[4])
-        followed = np.shape(step[2]) == np.shape(step[0]) and not isinstance(step[3], bool | np.bool_) and told_apart
-        names = SB3_STEP if followed or isinstance(step[2], Mapping) else STEP
+        told_apart = _n_axes(step[0]) > 0 or type(step[3]) is not type(step[4])
+        followed = _shape(step[2]) == _shape(step[0]) and not isinstance(step[3], bool | np.bool_) and told_apart
+        names = SB3_STEP if followed or isinstance(step[2], Mapping | tuple) else STEP
     found = {name: part for name, part in zip(names, parts, strict=True) if name != "next_observation"}
     return {**found, **({INFO[0]: infos[0]} if infos else {})}
 
@@ -249,10 +255,12 @@ def _arrays_of_episode(episode: Any, where: str) -> Mapping[str, Any]:
 
 
 def _stacked(observations: Sequence[Any]) -> Any:
-    """One observation after the other as (T, ...), dictionaries as a dictionary of such."""
-    if isinstance(observations[0], Mapping):
-        return {key: _stacked([observation[key] for observation in observations]) for key in observations[0]}
-    return np.stack([np.asarray(observation) for observation in observations])
+    """One observation after the other as (T, ...), dictionaries as a dictionary of such, tuples by the places of parts."""
+    first = observations[0]
+    if isinstance(first, Mapping | tuple):
+        keys = first if isinstance(first, Mapping) else range(len(first))
+        return {key: _stacked([observation[key] for observation in observations]) for key in keys}
+    return np.stack([np.asarray(observation) for observation in observations]) if np.ndim(first) else np.array(observations)
 
 
 def _of_arrays(
@@ -271,7 +279,10 @@ def _of_arrays(
         given = [np.asarray(arrays[key]).reshape(-1) for key in names if key in arrays]
         if given and given[0][:-1].any():
             step = int(np.argmax(given[0]))
-            raise DatasetError(f"{where}: ends at step {step} of {len(given[0])}; arrays of several episodes need no list.")
+            raise DatasetError(
+                f"{where}: ends at step {step} of {len(given[0])}; arrays of several episodes need no list, "
+                "or stand in one as {'dataset': arrays}."
+            )
         return bool(given[0][-1]) if given else False
 
     actions = np.asarray(find(ACTIONS))

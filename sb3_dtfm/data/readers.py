@@ -16,7 +16,7 @@ from sb3_dtfm.arguments import BOOLEAN, POSITIVE, Number, Rule, check_arguments,
 from sb3_dtfm.data.arrays import is_table
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, load_cached
-from sb3_dtfm.data.flat import fingerprint_flat_file, is_flat_file, is_mapping, load_flat
+from sb3_dtfm.data.flat import fingerprint_flat_file, holds_episodes, is_flat_file, is_mapping, load_flat
 from sb3_dtfm.data.in_memory import (
     is_episodes,
     is_replay_buffer,
@@ -68,14 +68,14 @@ class Reader(NamedTuple):
 
 
 def is_several(dataset: Any) -> bool:
-    """Return whether this is a list of datasets, and not of episodes."""
-    return is_episodes(dataset) and len(dataset) > 0 and all(_is_one_of_several(each) for each in dataset)
+    """Return whether this is a list of datasets, and not of episodes: one entry that can be no episode tells."""
+    return is_episodes(dataset) and any(_is_no_episode(each) for each in dataset)
 
 
-def _is_one_of_several(dataset: Any) -> bool:
+def _is_no_episode(dataset: Any) -> bool:
     if is_mapping(dataset):
-        return "dataset" in dataset
-    return isinstance(dataset, str | os.PathLike | MinariDataset | ReplayBuffer | TrajectoryBuffer)
+        return "dataset" in dataset or holds_episodes(dataset)
+    return is_table(dataset) or isinstance(dataset, str | os.PathLike | MinariDataset | ReplayBuffer | TrajectoryBuffer)
 
 
 def load_several(
@@ -102,7 +102,7 @@ def load_several(
     """
     buffers, weights = [], []
     for each in datasets:
-        options = without_pickles(each) if is_mapping(each) else {"dataset": each}
+        options = without_pickles(each) if is_mapping(each) and "dataset" in each else {"dataset": each}
         dataset, weight = options.pop("dataset"), options.pop("weight", 1.0)
         if not POSITIVE.accepts(weight):
             raise DatasetError(f"dataset {dataset!s}: weight is {weight!r}; a positive number is accepted.")
@@ -127,8 +127,8 @@ READERS = (
     Reader("a Minari id (namespace/name-vN) or MinariDataset", is_minari, load_minari, fingerprint_minari),
     Reader("a dictionary of flat arrays", is_mapping, load_flat, None),
     Reader("a DataFrame", is_table, load_flat, None),
-    Reader("a list of datasets", is_several, load_several, None),
     Reader("a list of steps", is_steps, load_steps, None),
+    Reader("a list of datasets", is_several, load_several, None),
     Reader("a list of episodes", is_episodes, load_episodes, None),
     Reader("an SB3 ReplayBuffer", is_replay_buffer, load_replay_buffer, None),
     Reader("a TrajectoryBuffer", lambda dataset: isinstance(dataset, TrajectoryBuffer), lambda dataset: dataset, None),
@@ -192,9 +192,13 @@ def load_dataset(
     accepted = [*own, *(["cache_dir"] if reader.fingerprint else []), *COMMON_OPTIONS]
     unknown = sorted(set(given) - set(accepted))
     if unknown:
+        is_path = isinstance(dataset, str | os.PathLike) and reader.load is not load_minari
+        if is_path and not Path(dataset).expanduser().exists():
+            raise DatasetError(f"{Path(dataset).expanduser().absolute()} does not exist; {reader.kind} is expected.")
         name = reader.kind if is_mapping(dataset) or is_episodes(dataset) or is_table(dataset) else str(dataset)
+        of_one = f" Those of a single one: {{'dataset': ..., {unknown[0]!r}: ...}}." if is_several(dataset) else ""
         raise TypeError(
-            f"dataset {name}: unknown option {with_nearest(unknown, accepted)}; accepted: {', '.join(accepted)}."
+            f"dataset {name}: unknown option {with_nearest(unknown, accepted)}; accepted: {', '.join(accepted)}.{of_one}"
         )
     common: dict[str, Any] = {"action_space": action_space, "observation_space": observation_space, "env_id": env_id}
     common.update(env_args=env_args, max_episode_steps=max_episode_steps, allow_pickle=allow_pickle)
@@ -238,6 +242,6 @@ def _find_reader(dataset: Any) -> Reader:
     for reader in READERS:
         if reader.accepts(dataset):
             return reader
-    found = repr(dataset) if isinstance(dataset, str) else f"a {type(dataset).__name__}"
+    found = repr(str(dataset)) if isinstance(dataset, str | os.PathLike) else f"a {type(dataset).__name__}"
     kinds = ", ".join(reader.kind for reader in READERS)
     raise DatasetError(f"dataset is {found}; accepted are {kinds}.")

@@ -29,11 +29,15 @@ OLD_LAYOUT_TOLERANCE = 1e-3  # metres
 
 
 def is_robomimic(dataset: Any) -> bool:
-    """Return whether this is the path of a file: one that exists, or a name that nothing else would have."""
-    if not isinstance(dataset, str):
-        return isinstance(dataset, os.PathLike)
-    looks_like_a_path = dataset.startswith((".", "~", os.sep)) or dataset.endswith(HDF5_SUFFIXES)
-    return looks_like_a_path or os.path.isfile(dataset)
+    """Return whether this is the path of a hdf5 file, or a name that nothing else would have of what does not exist."""
+    if not isinstance(dataset, str | os.PathLike):
+        return False
+    path = os.path.expanduser(os.fspath(dataset))
+    if path.endswith(HDF5_SUFFIXES):
+        return True
+    if os.path.isfile(path):
+        return h5py.is_hdf5(path)
+    return not isinstance(dataset, str) or dataset.startswith((".", "~", os.sep))
 
 
 def fingerprint_robomimic(path: str | os.PathLike[str], options: dict[str, Any]) -> Fingerprint:

@@ -1,9 +1,12 @@
 """What is already in memory: lists of episodes and SB3's replay buffers."""
 
+import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 import pytest
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
@@ -15,6 +18,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_dtfm import DT
 from sb3_dtfm.data import DatasetError, Trajectory, load_dataset
 from sb3_dtfm.envs import ReturnToGoWrapper
+from sb3_dtfm.envs.return_to_go import sort_observation_space
 
 LENGTHS, N_ACTIONS = (3, 5), 2
 
@@ -375,3 +379,67 @@ def test_a_replay_buffers_images_stay_bytes():
     alone = load_dataset(replay_buffer, observation_keys=["camera"])
     assert list(alone.image_spaces) == ["camera"]
     assert (alone.observations == 0).all()
+
+
+def several_episodes() -> dict[str, Any]:
+    """Flat arrays of three episodes of 20 steps."""
+    rng = np.random.default_rng(0)
+    flat = {"observations": rng.random((60, 3)), "actions": rng.uniform(-1, 1, (60, 1)), "rewards": rng.random(60)}
+    return {**flat, "episode_ends": [20, 40, 60]}
+
+
+@pytest.mark.parametrize(
+    "ends", [{"episode_ends": [20, 40, 60]}, {"episode_lengths": [20] * 3}, {"episode": np.arange(60) // 20}]
+)
+@pytest.mark.parametrize("n", [1, 2])
+def test_arrays_of_several_episodes_in_a_list_are_datasets(ends, n):
+    """As episodes they would be one of 60 steps each, and the returns-to-go would not end where they do."""
+    arrays = {**several_episodes(), **ends}
+    if "episode_ends" not in ends:
+        del arrays["episode_ends"]
+    buffer = load_dataset([arrays] * n, action_space=spaces.Box(-1, 1, (1,)))
+    assert buffer.episode_lengths.tolist() == [20] * 3 * n
+    with pytest.raises(
+        TypeError, match=r"unknown option action_bounds .* Those of a single one: \{'dataset': \.\.\., 'action_b"
+    ):
+        load_dataset([arrays] * n, action_bounds=(-1, 1))
+
+
+def test_a_list_mixes_files_tables_buffers_and_arrays(tmp_path):
+    space, arrays = spaces.Box(-1, 1, (1,)), several_episodes()
+    np.savez(tmp_path / "flat.npz", **arrays)
+    alone = {name: array for name, array in arrays.items() if name != "episode_ends"}
+    others = [tmp_path / "flat.npz", load_dataset(arrays, action_space=space), {"dataset": arrays, "weight": 3}]
+    for other in others:
+        assert load_dataset([arrays, other], action_space=space).episode_lengths.tolist() == [20] * 6
+        with pytest.raises(DatasetError, match="does not say where episodes end"):
+            load_dataset([alone, other], action_space=space)
+    assert load_dataset([alone, alone], action_space=space).episode_lengths.tolist() == [60, 60]
+    table = pd.DataFrame({"obs": [0.0, 1.0], "action": [0.5, -0.5], "reward": [1.0, 2.0], "done": [0, 1]})
+    assert load_dataset([table, table], action_space=space).episode_lengths.tolist() == [2, 2]
+
+
+TUPLES = {
+    "a Box and a Discrete": spaces.Tuple((spaces.Box(-1, 1, (2,)), spaces.Discrete(3))),
+    "Boxes": spaces.Tuple((spaces.Box(-1, 1, (2,)), spaces.Box(-1, 1, (3,)))),
+    "Blackjack's": spaces.Tuple((spaces.Discrete(32), spaces.Discrete(11), spaces.Discrete(2))),
+    "in a Dict": spaces.Dict(seen=spaces.Tuple((spaces.Box(-1, 1, (2,)), spaces.Discrete(3))), goal=spaces.Box(-1, 1, (1,))),
+}
+
+
+@pytest.mark.parametrize("kind", TUPLES)
+@pytest.mark.parametrize("followed", [False, True])
+@pytest.mark.parametrize("nested", [False, True])
+def test_tuple_observations_are_those_of_the_wrapper(kind, followed, nested):
+    space = TUPLES[kind]
+    space.seed(0)
+    seen = [space.sample() for _ in range(7)]
+    action = np.array([0.5])
+    steps = [
+        (before, action, after, 1.0, t == 5) if followed else (before, action, 1.0, t == 5, False)
+        for t, (before, after) in enumerate(itertools.pairwise(seen))
+    ]
+    buffer = load_dataset([steps, steps] if nested else steps, action_space=spaces.Box(-1, 1, (1,)), observation_space=space)
+    expected = [spaces.flatten(sort_observation_space(space), each) for each in seen[:-1]]
+    np.testing.assert_array_equal(buffer.observations[: len(expected)], np.float32(expected))
+    assert buffer.rewards[:6].tolist() == [1.0] * 6

@@ -155,6 +155,18 @@ def test_a_missing_file_is_named(name: str):
         load_dataset(name)
 
 
+def test_a_missing_file_is_named_before_an_option_that_it_would_not_have():
+    with pytest.raises(DatasetError, match=r"missing.hdf5 does not exist; the path of a robomimic file"):
+        load_dataset("missing.hdf5", action_bounds=(-1, 1))
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_a_file_of_another_kind_is_refused_with_what_is_accepted(kind: type, tmp_path: Path):
+    (tmp_path / "steps.txt").write_text("0 1 2")
+    with pytest.raises(DatasetError, match=r"steps.txt'; accepted are the path of .*\.npz.*\.csv"):
+        load_dataset(kind(tmp_path / "steps.txt"))
+
+
 def test_a_folder_is_no_dataset(tmp_path: Path):
     with pytest.raises(DatasetError, match="is a folder"):
         load_dataset(tmp_path)
