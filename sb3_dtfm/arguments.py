@@ -100,6 +100,16 @@ def check_arguments(given: Mapping[str, Any], accepted: Mapping[str, Rule]) -> d
     return values
 
 
+def whole_timesteps(total_timesteps: Any) -> int:
+    """
+    :param total_timesteps: of `learn`; 1e5 is whole, too
+    :raises ValueError: no whole number of at least 0
+    """
+    whole = int(total_timesteps) if isinstance(total_timesteps, float) and total_timesteps.is_integer() else total_timesteps
+    check_arguments({"total_timesteps": whole}, {"total_timesteps": Number(low=0, whole=True)})
+    return int(whole)
+
+
 def option(default: Any, rule: Rule, acting: bool = False) -> Any:
     """
     A field of :class:`Options`.

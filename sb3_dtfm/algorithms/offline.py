@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import configure_logger, update_learning_rat
 
 from sb3_dtfm.algorithms.model import POLICY_NAMES, SequenceModel
 from sb3_dtfm.algorithms.options import TrainingOptions
-from sb3_dtfm.arguments import POSITIVE, documented_parameters
+from sb3_dtfm.arguments import POSITIVE, documented_parameters, whole_timesteps
 from sb3_dtfm.callbacks import GradientStepProgressBar, TimeLeft, combine_callbacks
 from sb3_dtfm.data import Dataset, TrajectoryBuffer, check_controller, load_dataset, without_pickles
 from sb3_dtfm.data.decisions import Decision, decide_open, sentences
@@ -293,6 +293,7 @@ class OfflineAlgorithm(SequenceModel):
             checkpoint; such a step changes no weight
         :raises MemoryError: a gradient step needs more than there is, with what decides how much that is
         """
+        total_timesteps = whole_timesteps(total_timesteps)
         buffer = self.buffer or self._load_buffer()
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar

@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dtfm.algorithms import DTFM
-from sb3_dtfm.arguments import COUNT, POSITIVE, Rule, check_arguments
+from sb3_dtfm.arguments import COUNT, POSITIVE, Rule, check_arguments, whole_timesteps
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer, load_dataset
 from sb3_dtfm.data.buffer import with_npz
 from sb3_dtfm.distributed import DataParallel, n_processes
@@ -136,6 +136,7 @@ class OnlineDTFM(DTFM):
         :raises ValueError: no dataset, no environment, or an argument out of range
         :raises FloatingPointError: the loss or its gradient is no longer finite; such a step changes no weight
         """
+        total_timesteps = whole_timesteps(total_timesteps)
         if self.env is None:
             raise ValueError("OnlineDTFM has no environment to act in: load(path, env, dataset=...) or set_env().")
         self._check_online(self.env)

@@ -193,6 +193,20 @@ def test_numbers_of_numpy_are_numbers(algorithm, cheetah_buffer, tmp_path):
     )
 
 
+@pytest.mark.parametrize("steps", [2.0, np.float64(2), np.int32(2)])
+def test_a_number_of_steps_may_be_written_as_a_float(steps, cheetah_buffer, tmp_path):
+    """As 1e5, which Stable-Baselines3 takes, too; the model can be loaded."""
+    model = make_model(DT, cheetah_buffer).learn(steps)
+    model.save(tmp_path / "model")
+    assert DT.load(tmp_path / "model").num_timesteps == 2
+
+
+@pytest.mark.parametrize("steps", [2.5, float("nan"), float("inf"), -1, "2", None, True])
+def test_a_number_of_steps_that_is_none_is_refused(steps, cheetah_buffer):
+    with pytest.raises(ValueError, match="total_timesteps must be a whole number of at least 0, got"):
+        make_model(DT, cheetah_buffer).learn(steps)
+
+
 def first_action(policy) -> np.ndarray:
     observation, _ = make_env().reset(seed=0)
     return policy.predict(observation, deterministic=True)[0]
