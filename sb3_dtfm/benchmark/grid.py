@@ -19,11 +19,10 @@ from sb3_dtfm.benchmark.settings import (
     check_same_transformer,
     cloning_settings,
     profile_name,
-    read_yaml,
     task_settings,
 )
 from sb3_dtfm.data.inspection import suggested_target_return
-from sb3_dtfm.zoo.arguments import UsageError, find_target_return, import_packages, with_target_return
+from sb3_dtfm.zoo.arguments import UsageError, find_target_return, import_packages, read_yaml, with_target_return
 
 N_EVALUATIONS = 10  # of a run, unless --eval-freq says otherwise
 # Values of --algo.

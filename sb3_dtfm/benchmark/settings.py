@@ -11,7 +11,7 @@ import yaml
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.rows import BASELINES
-from sb3_dtfm.zoo.arguments import UsageError, with_target_return
+from sb3_dtfm.zoo.arguments import UsageError, read_yaml, with_target_return
 from sb3_dtfm.zoo.registration import packaged_config, policy_of, with_policy_options
 
 PROFILES = {"default": None, "paper": "paper"}
@@ -67,21 +67,6 @@ class Task(NamedTuple):
 def profile_name(profile: str) -> str:
     """Name of a profile in rows: its own, or that of its file or folder."""
     return profile if profile in PROFILES else Path(profile).stem
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """
-    A mapping by task.
-
-    :raises UsageError: no YAML, or something else in it
-    """
-    try:
-        content = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
-        raise UsageError(f"{path}: is not YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(content, dict):
-        raise UsageError(f"{path}: expected a mapping by task, found {content!r:.40}.")
-    return {str(task): value for task, value in content.items()}
 
 
 def read_profile(profile: str, algo: str, env_id: str) -> dict[str, Any]:

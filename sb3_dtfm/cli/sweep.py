@@ -60,7 +60,9 @@ def main(argv: Sequence[str]) -> None:
     options = _parser().parse_args(argv)
     import_packages(options.gym_packages)
     algorithms = [options.algo or algorithm_of(model) for model in options.models]
-    returns = load_dataset(options.dataset, **key_values("--dataset-kwargs", options.dataset_kwargs)).episode_returns
+    buffer = load_dataset(options.dataset, **key_values("--dataset-kwargs", options.dataset_kwargs))
+    buffer.check_task(options.env)
+    returns = buffer.episode_returns
     agents = [find_agent(model, options.env) for model in options.models]
     models = [load_agent(algo, agent.model, "cpu") for algo, agent in zip(algorithms, agents, strict=True)]
     acting = key_values("--acting", options.acting)

@@ -287,7 +287,7 @@ def train_arguments(argv: Sequence[str]) -> list[str]:
         conf_file = str(packaged_config(options.algo, conf_file))
     elif conf_file is None:
         conf_file = online_config(options.algo, options.env)
-    shorthands = _shorthands(options, {**_listed(conf_file, options.env), **given})
+    shorthands = _shorthands(options, {**listed_settings(conf_file, options.env), **given})
     if options.algo not in ALGORITHMS and shorthands:
         names = ", ".join(option for option, _ in shorthands)
         raise UsageError(f"{names}: for --algo {' and '.join(ALGORITHMS)} only, not for {options.algo}.")
@@ -338,12 +338,35 @@ def _check_task(conf_file: str, env_id: str, hyperparams: Sequence[str]) -> None
         raise UsageError(f"--dataset: needed for {env_id}, which {conf_file} does not list.")
 
 
-def _listed(conf_file: str | None, env_id: str) -> dict[str, Any]:
-    """The settings of a task in a YAML file; none in a file of another kind, or where there is none to read."""
+def listed_settings(conf_file: str | None, env_id: str) -> dict[str, Any]:
+    """
+    The settings of a task in a YAML file; none in a file of another kind, or where there is none to read.
+
+    :raises UsageError: no YAML, or something else than settings in it
+    """
     if conf_file is None or not Path(conf_file).is_file() or Path(conf_file).suffix not in (".yml", ".yaml"):
         return {}
-    entries = yaml.safe_load(Path(conf_file).read_text()) or {}
-    return entries.get(env_id) or entries.get("default") or {}
+    entries = read_yaml(Path(conf_file))
+    name = env_id if env_id in entries else "default"
+    settings = entries.get(name) or {}
+    if not isinstance(settings, dict):
+        raise UsageError(f"{conf_file}: {name}: expected settings, found {settings!r:.40}.")
+    return settings
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """
+    A mapping by task.
+
+    :raises UsageError: no YAML, or something else in it
+    """
+    try:
+        content = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: is not YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(content, dict):
+        raise UsageError(f"{path}: expected a mapping by task, found {content!r:.40}.")
+    return {str(task): value for task, value in content.items()}
 
 
 def _shorthands(options: argparse.Namespace, settings: dict[str, Any]) -> list[tuple[str, str]]:

@@ -103,6 +103,7 @@ def enjoy(arguments: Sequence[str], target_return: float | None = None) -> None:
     """
     found: list[tuple[FoundModel, EnvironmentName]] = []
     envs: list[EpisodesOf] = []
+    asked: list[float] = []
 
     def find(exp_id: int, folder: str, algo: str, env_name: EnvironmentName, *args: Any) -> FoundModel:
         found.append((find_model(exp_id, folder, algo, env_name, *args), env_name))
@@ -112,14 +113,16 @@ def enjoy(arguments: Sequence[str], target_return: float | None = None) -> None:
         envs.append(EpisodesOf(_without_pickles(found[-1][0], *args, **kwargs)))
         if target_return is not None:
             envs[-1].env_method("set_target_return", target_return)
+        if not holds_pickles(found[-1][0].path):  # those of RL-Zoo's own algorithms
+            asked.append(envs[-1].get_attr("target_return")[0])
         return envs[-1]
 
     script: Any = rl_zoo3.enjoy
     script.get_model_path, script.create_test_env, script.StoreDict = find, make, StoreValues
     _call(script.enjoy, "enjoy", arguments)
     model, env_name = found[-1]
-    if not holds_pickles(model.path):  # those of RL-Zoo's own algorithms
-        attributes = {**read_configuration(model.path)["attributes"], "target_return": envs[-1].get_attr("target_return")[0]}
+    if asked:
+        attributes = {**read_configuration(model.path)["attributes"], "target_return": asked[-1]}
         for sentence in compare(attributes, envs[-1].returns, envs[-1].successes, Path(model.run), env_name):
             print(sentence)
 

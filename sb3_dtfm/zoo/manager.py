@@ -26,13 +26,24 @@ from sb3_dtfm.arguments import COUNT, Number, with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.distributed import is_first_process
 from sb3_dtfm.files import CLASSES
-from sb3_dtfm.zoo.arguments import Restored, UsageError, check_device, find_target_return, with_target_return
+from sb3_dtfm.zoo.arguments import (
+    Restored,
+    UsageError,
+    check_device,
+    find_target_return,
+    listed_settings,
+    with_target_return,
+)
 from sb3_dtfm.zoo.comparison import MeasureRandomActions, compare
 from sb3_dtfm.zoo.registration import with_policy_options
 from sb3_dtfm.zoo.resuming import CHECKPOINT, KeepCheckpoint, ReplaceEvaluations, Start, StopSignals, go_on
 
 # Keys of its YAML files that no algorithm sees.
 OF_RL_ZOO = ("n_timesteps", "n_envs", "normalize", "frame_stack", "callback", "env_wrapper", "vec_env_wrapper", "env_kwargs")
+
+
+# Those that it reads as schedules: a number, or as lin_0.001 one that falls to 0.
+SCHEDULES = frozenset({"learning_rate", "clip_range", "clip_range_vf", "delta_std"})
 
 
 class TrialNumber(int):
@@ -120,6 +131,8 @@ class OfflineExperimentManager(ExperimentManager):
             raise UsageError(f"n_envs must be {COUNT}, got {hyperparams['n_envs']!r}.")
         if self.n_timesteps < 1 and not Number(low=1).accepts(hyperparams.get("n_timesteps", 1)):
             raise UsageError(f"n_timesteps must be {COUNT}, got {hyperparams['n_timesteps']!r}; -n gives another one.")
+        for name in SCHEDULES & hyperparams.keys():
+            hyperparams[name] = _as_schedule(name, hyperparams[name])
         for name in CLASSES:
             given = hyperparams.get(name)
             for each in given if isinstance(given, list) else [given]:
@@ -129,6 +142,7 @@ class OfflineExperimentManager(ExperimentManager):
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Read settings as RL-Zoo does; policy options may stand among them, and the ReturnToGoWrapper may be left out."""
+        listed_settings(self.config, self.env_name.gym_id)  # whose errors name the file
         hyperparams, saved = super().read_hyperparameters()
         if self.restored is not None:
             hyperparams = self.restored.check_config(self.config, hyperparams)
@@ -302,3 +316,20 @@ class OfflineExperimentManager(ExperimentManager):
                 print(sentence)
         if self.signals.terminated and not ended:
             raise SystemExit(128 + signal.SIGTERM)
+
+
+def _as_schedule(name: str, value: Any) -> Any:
+    """
+    What RL-Zoo reads: YAML takes 1e-3 for text, and so does it.
+
+    :raises UsageError: text that is neither a number nor a schedule
+    """
+    if not isinstance(value, str):
+        return value
+    with contextlib.suppress(ValueError):
+        return float(value)
+    try:
+        float(value.partition("_")[2])
+    except ValueError:
+        raise UsageError(f"{name}: expected a number, or lin_0.001 for one that falls to 0, got {value!r}.") from None
+    return value

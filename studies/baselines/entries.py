@@ -14,10 +14,10 @@ from baselines.process import BaselineProcess
 from sb3_dtfm.benchmark import provenance
 from sb3_dtfm.benchmark.evaluation import FINAL_STATES, evaluate, make_seeded_envs
 from sb3_dtfm.benchmark.rows import Row, RunKey, read_rows
-from sb3_dtfm.benchmark.settings import Task, read_yaml, task_settings
+from sb3_dtfm.benchmark.settings import Task, task_settings
 from sb3_dtfm.data import TrajectoryBuffer, load_dataset
 from sb3_dtfm.envs import known_task
-from sb3_dtfm.zoo.arguments import UsageError
+from sb3_dtfm.zoo.arguments import UsageError, read_yaml
 
 HERE = Path(__file__).parent
 PROFILE = "authors"  # what the rows call the baselines' settings

@@ -35,6 +35,8 @@ def test_train_writes_what_enjoy_reads(algo, workplace, capsys):
         capsys.readouterr()
         assert main(["enjoy", "--algo", algo, *ENJOY, *choice]) == 0
         assert "2 Episodes\n" in capsys.readouterr().out
+    assert main(["enjoy", "--algo", algo, *ENJOY, "--n-envs", "2"]) == 0, "in processes of their own, which RL-Zoo closes"
+    assert "Recorded" in capsys.readouterr().out
 
     assert main(["plot", str(run), "--tensorboard", str(next((workplace / "tb").glob("*/*_1")))]) == 0
     assert (run / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
@@ -78,10 +80,14 @@ def test_a_callback_of_the_users_own_runs_beside_the_evaluation(algo, workplace)
 
 def test_a_configuration_file_of_the_users_own_and_an_environment_it_does_not_list(workplace):
     settings = {"default": {"policy": "MultiInputPolicy", "n_timesteps": 2, "context_length": 3}}
-    (workplace / "mine.yml").write_text(yaml.safe_dump(settings))
+    (workplace / "mine.yml").write_text(
+        yaml.safe_dump(settings).replace("n_timesteps", "learning_rate: 3e-4\n  n_timesteps")
+    )
+    assert isinstance(yaml.safe_load("3e-4"), str), "YAML takes it for text"
     assert train("dt", "--conf-file", "mine.yml", "--target-return", "50", "--eval-freq", "-1") == 0
     model = DT.load(workplace / "logs" / "dt" / "HalfCheetah-v5_1" / "HalfCheetah-v5.zip")
     assert (model.context_length, model.batch_size) == (3, 4)
+    assert model.lr_schedule(1.0) == 3e-4
 
 
 def test_rl_zoos_own_algorithms_still_train(workplace):

@@ -74,6 +74,10 @@ def test_long_paths_are_named_by_what_tells_them_apart():
         (["nowhere.zip", "--algo", "dt", *SWEEP], "nowhere.zip does not exist; expected a file that a Stable-Baselines3"),
         (["model.zip", *SWEEP], "model.zip: of which algorithm? Expected a folder dt or dtfm in its path, or --algo."),
         (["dt/model.zip", *SWEEP, "--dataset", "none.npz"], "none.npz does not exist"),
+        (
+            ["dt/model.zip", *SWEEP, "--env", "Walker2d-v5"],
+            "was recorded in HalfCheetah-v5, and the environment is Walker2d-v5",
+        ),
         (["dt/model.zip", *SWEEP, "--gym-packages", "no_tasks"], "--gym-packages no_tasks: No module named 'no_tasks'"),
     ],
 )

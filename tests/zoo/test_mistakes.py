@@ -61,6 +61,28 @@ def test_a_mistake_of_params_is_one_line(parameter, message, workplace, capsys):
     assert not list(Path().glob("logs/dtfm/*"))
 
 
+CONF_FILES = [
+    ("- a\n- b\n", "mine.yml: expected a mapping by task, found ['a', 'b']"),
+    ("HalfCheetah-v5:\n\tpolicy: x\n", "mine.yml: is not YAML: while scanning"),
+    ("HalfCheetah-v5: 3\n", "mine.yml: HalfCheetah-v5: expected settings, found 3"),
+    ("default: [1]\n", "mine.yml: default: expected settings, found [1]"),
+    (
+        "default: {learning_rate: slow}\n",
+        "learning_rate: expected a number, or lin_0.001 for one that falls to 0, got 'slow'",
+    ),
+    ("default: {learning_rate: lin_x}\n", "learning_rate: expected a number, or lin_0.001"),
+]
+
+
+@pytest.mark.parametrize(("content", "message"), CONF_FILES)
+def test_a_mistake_of_a_conf_file_is_one_line(content, message, workplace, capsys):
+    Path("mine.yml").write_text(content)
+    arguments = ["--algo", "dtfm", "--env", "HalfCheetah-v5", "--conf-file", "mine.yml", "--dataset", DATASET_ID, "-n", "2"]
+    assert main(["train", *arguments]) == 2
+    assert is_one_line(capsys, message)
+    assert not list(Path().glob("logs/dtfm/*"))
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
