@@ -85,8 +85,10 @@ def is_mapping(dataset: Any) -> bool:
 
 
 def holds_episodes(arrays: Mapping[str, Any]) -> bool:
-    """Return whether arrays number their episodes, as those of one episode do not."""
-    return any(np.size(arrays[name]) > 1 for name in (ENDS, LENGTHS, *EPISODES) if name in arrays)
+    """Return whether arrays tell of several episodes, by their ends, lengths or numbers."""
+    numbers = (np.ravel(arrays[name]) for name in EPISODES if name in arrays)
+    counted = any(np.size(arrays[name]) > 1 for name in (ENDS, LENGTHS) if name in arrays)
+    return counted or any((array != array[:1]).any() for array in numbers)
 
 
 def fingerprint_flat_file(path: str | os.PathLike[str], options: dict[str, Any]) -> Fingerprint:

@@ -414,7 +414,8 @@ def test_a_list_mixes_files_tables_buffers_and_arrays(tmp_path):
         assert load_dataset([arrays, other], action_space=space).episode_lengths.tolist() == [20] * 6
         with pytest.raises(DatasetError, match="does not say where episodes end"):
             load_dataset([alone, other], action_space=space)
-    assert load_dataset([alone, alone], action_space=space).episode_lengths.tolist() == [60, 60]
+    numbered = {**alone, "episode": np.full(60, 7)}
+    assert load_dataset([alone, numbered], action_bounds=(-1, 1)).episode_lengths.tolist() == [60, 60], "one episode each"
     table = pd.DataFrame({"obs": [0.0, 1.0], "action": [0.5, -0.5], "reward": [1.0, 2.0], "done": [0, 1]})
     assert load_dataset([table, table], action_space=space).episode_lengths.tolist() == [2, 2]
 
