@@ -49,23 +49,29 @@ class Tracking(gym.Wrapper):
     :param env: Go1Velocity-v0
     :ivar errors: of each finished episode, mean distance of the velocity from the command along the floor, m/s, and of the
         turn rate from its command, rad/s
+    :ivar walked: of each finished episode, sums over its steps: velocity times command, and the command's square, (m/s)^2
     """
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
         self.errors: list[list[float]] = []
+        self.walked: list[list[float]] = []
         self._errors: list[np.ndarray] = []
+        self._commands: list[np.ndarray] = []
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        self._errors = []
+        self._errors, self._commands = [], []
         return self.env.reset(**kwargs)
 
     def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         command = self.get_wrapper_attr("command")  # before the step may draw another
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._errors.append(info["velocity"] - command)
+        self._commands.append(command[:2])
         if terminated or truncated:
-            errors = np.array(self._errors)
+            errors, commands = np.array(self._errors), np.array(self._commands)
+            squares = np.sum(commands**2)
+            self.walked.append([float(squares + np.sum(errors[:, :2] * commands)), float(squares)])
             moved, turned = np.linalg.norm(errors[:, :2], axis=1), np.abs(errors[:, 2])
             self.errors.append([float(moved.mean()), float(turned.mean())])
         return observation, reward, terminated, truncated, info
@@ -95,16 +101,18 @@ def judge(agent: Any, env_kwargs: dict[str, Any], wrappers: Sequence[Any], n_epi
     start = time.perf_counter()
     try:
         episodes = evaluate(agent, envs, range(FINAL_STATES, FINAL_STATES + n_episodes))
-        errors = np.array([error for of_env in envs.get_attr("errors") for error in of_env])
+        errors, walked = (np.concatenate(envs.get_attr(name)) for name in ("errors", "walked"))
     finally:
         envs.close()
     error, turn_error = errors.mean(axis=0)
+    along, squares = walked.sum(axis=0)
     return {
         "episodes": n_episodes,
         "falls": sum(length < EPISODE_STEPS for length in episodes.lengths),
         "fallen_at": sorted(length for length in episodes.lengths if length < EPISODE_STEPS),
         "error": round(float(error), 4),
         "turn_error": round(float(turn_error), 4),
+        "speed_share": round(float(along / squares), 4),
         "mean_return": round(float(np.mean(episodes.returns)), 3),
         "evaluation_s": round(time.perf_counter() - start, 1),
     }

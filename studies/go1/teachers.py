@@ -1,5 +1,6 @@
 """
-Teachers that are disturbed in ways that `--noise` does not know, so that a velocity is not what its command lets expect.
+Teachers that are disturbed in ways that `--noise` does not know, so that a velocity is not what its command lets expect; and
+teachers that walk more slowly than they are asked.
 
     R="sb3-dtfm record --algo onnx --model go1_policy.onnx --env Go1Velocity-v0 --gym-packages go1.teachers --episodes 250"
     PYTHONPATH=studies $R --seed 6 --env-wrapper go1.teachers.Restless --dataset-id go1/restless-v0
@@ -82,3 +83,30 @@ class Dragged(TeacherObservation):
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(Drag(env))
+
+
+class Gentle(TeacherObservation):
+    """
+    A teacher who is told a third of the command, and walks at a third of the speed.
+
+    :param env: Go1Velocity-v0
+    """
+
+    SHARE = 1 / 3
+
+    def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        observation, info = super().reset(**kwargs)
+        return self._told(observation), info
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
+        observation, *rest = super().step(action)
+        return self._told(observation), *rest
+
+    def _told(self, observation: np.ndarray) -> np.ndarray:
+        return np.concatenate((observation[:-3], self.SHARE * observation[-3:]))
+
+
+class Moderate(Gentle):
+    """A teacher who is told two thirds of the command."""
+
+    SHARE = 2 / 3
