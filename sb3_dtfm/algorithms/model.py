@@ -1,5 +1,6 @@
 """A model as Stable-Baselines3 knows it: a policy, environments that it acts in, and files that run no code."""
 
+import inspect
 import io
 from collections.abc import Iterable
 from importlib.metadata import version
@@ -28,7 +29,7 @@ from sb3_dtfm.algorithms.saving import (
     optimizers,
     to_configuration,
 )
-from sb3_dtfm.arguments import NOT_NEGATIVE, POSITIVE, Number, Rule, check_arguments
+from sb3_dtfm.arguments import NOT_NEGATIVE, POSITIVE, Number, Rule, check_arguments, with_nearest
 from sb3_dtfm.data import (
     DatasetError,
     ReturnReference,
@@ -43,6 +44,7 @@ from sb3_dtfm.files import ModelFile, ModelFileError, file_name, holds_pickles, 
 from sb3_dtfm.optimization import RunningMeans
 from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.policies.exported import ExportedPolicy
+from sb3_dtfm.policies.images import extractor_name
 
 # The names of an algorithm's one policy: Stable-Baselines3's for dictionaries, which it observes, for vectors and images.
 POLICY_NAMES = ("MultiInputPolicy", "MlpPolicy", "CnnPolicy")
@@ -105,7 +107,7 @@ class SequenceModel(BaseAlgorithm):
             self._get_policy_from_name(policy) if isinstance(policy, str) else policy,
             env,
             learning_rate,
-            policy_kwargs=policy_kwargs,
+            policy_kwargs=_with_names(policy_kwargs),
             tensorboard_log=tensorboard_log,
             verbose=verbose,
             device=device,
@@ -314,6 +316,8 @@ class SequenceModel(BaseAlgorithm):
         """
         saved = read_saved(path, cls.policy_aliases, custom_objects, get_device(device), print_system_info)
         attributes, source = saved.attributes, saved.source
+        if "policy_kwargs" in changed:
+            changed = {**changed, "policy_kwargs": _with_names(changed["policy_kwargs"])}
         if changed.get("policy_kwargs", attributes.get("policy_kwargs")) != attributes.get("policy_kwargs"):
             raise ValueError(
                 f"policy_kwargs are what the weights of {source} were made with, {attributes.get('policy_kwargs')}, and "
@@ -330,6 +334,9 @@ class SequenceModel(BaseAlgorithm):
             if name in never or hasattr(cls, name) or not name.isidentifier():
                 raise ModelFileError(f"{source}: {name!r} is no attribute that a model is saved with.")
         vars(model).update(attributes)
+        known = {*vars(model), *inspect.signature(cls).parameters}
+        if unknown := sorted(set(changed) - known):
+            raise ValueError(f"load: {with_nearest(unknown, known)}: no attribute of {cls.__name__}.")
         model._check_saved(saved)
         vars(model).update(changed)
         model._setup_model()
@@ -451,3 +458,11 @@ class SequenceModel(BaseAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return [POLICY, *optimizers(self.policy)], []
+
+
+def _with_names(policy_kwargs: Any) -> Any:
+    """Arguments of the policy with the name of a class for images, as files have them."""
+    name = "features_extractor_class"
+    if not isinstance(policy_kwargs, dict) or name not in policy_kwargs:
+        return policy_kwargs
+    return {**policy_kwargs, name: extractor_name(policy_kwargs[name])}

@@ -75,7 +75,7 @@ def to_configuration(model: BaseAlgorithm, left_out: Iterable[str], wanted: Iter
             saved[name] = json.loads(json.dumps(value, allow_nan=False, default=_plain))
         except (TypeError, ValueError) as error:
             problem = f"{name} is no part of a saved model: it is a {type(value).__name__}, not plain values ({error})."
-            if name in wanted:
+            if name in wanted or name == "policy_kwargs":  # without which no file can be loaded
                 raise ValueError(problem) from error
             warnings.warn(problem, stacklevel=3)
     return {

@@ -122,6 +122,25 @@ def spatial_softmax(maps: th.Tensor) -> th.Tensor:
 EXTRACTORS: dict[str, type[BaseFeaturesExtractor]] = {
     each.__name__: each for each in (ResidualExtractor, NatureCNN, ResNet18)
 }
+PACKAGED = dict(EXTRACTORS)
+
+
+def extractor_name(given: Any) -> Any:
+    """
+    The name of an extractor, which a file can hold; a class of a user's own is entered in `EXTRACTORS`.
+
+    :param given: a class, or what is none already
+    :raises ValueError: no extractor of SB3's kind, or one that has the name of another
+    """
+    if not isinstance(given, type):
+        return given
+    name = given.__name__
+    if not issubclass(given, BaseFeaturesExtractor):
+        raise ValueError(f"features_extractor_class: {name} is no subclass of SB3's BaseFeaturesExtractor.")
+    if PACKAGED.get(name, given) is not given:
+        raise ValueError(f"features_extractor_class: {name} is the name of a packaged class; call yours something else.")
+    EXTRACTORS[name] = given
+    return name
 
 
 class ImageEncoder(nn.Module):

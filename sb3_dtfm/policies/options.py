@@ -17,7 +17,7 @@ from sb3_dtfm.arguments import (
     option,
 )
 from sb3_dtfm.heads.base import NOISE_ROWS
-from sb3_dtfm.policies.images import EXTRACTORS
+from sb3_dtfm.policies.images import EXTRACTORS, extractor_name
 from sb3_dtfm.policies.normalization import OBSERVATION_SCALINGS, RETURN_SCALINGS
 
 # N of best-of-N where a critic learns and no N is given.
@@ -123,9 +123,7 @@ class PolicyOptions(Options):
     kv_cache: bool = option(False, BOOLEAN, acting=True)
 
     def __post_init__(self) -> None:
-        given: Any = self.features_extractor_class
-        if isinstance(given, type):  # a file can hold its name
-            vars(self)["features_extractor_class"] = given.__name__
+        vars(self)["features_extractor_class"] = extractor_name(self.features_extractor_class)
         super().__post_init__()
         n_action_steps = (self.chunk_size + 1) // 2 if self.n_action_steps is None else self.n_action_steps
         accepted = {"n_action_steps": Number(low=1, high=self.chunk_size, whole=True)}

@@ -257,3 +257,10 @@ def test_the_constructor_takes_each_option_of_training_with_its_default(cheetah_
     given = {name: {int: 2, float: 0.5}.get(type(default), default) for name, default in defaults.items()}
     model = make_model(DT, cheetah_buffer, **given | {"batch_size": 8})
     assert TrainingOptions.of(vars(model)) == TrainingOptions(**given | {"batch_size": 8, "return_weighting": 0.0})
+
+
+def test_a_misspelt_attribute_is_refused_at_load(saved):
+    """Else a model would learn by what the file says, without a word."""
+    with pytest.raises(ValueError, match=r"load: bach_size \(did you mean batch_size\?\): no attribute of DT"):
+        DT.load(saved / "DT", bach_size=8)
+    assert DT.load(saved / "DT", batch_size=8, dataset=None).batch_size == 8

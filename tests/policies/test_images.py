@@ -9,7 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.torch_layers import NatureCNN
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_dtfm import DT, DTFM
@@ -119,7 +119,7 @@ def test_images_alone_are_enough(tmp_path):
     assert np.isfinite(model.predict(model.get_env().reset())[0]).all()
 
 
-def test_sb3s_own_network_and_one_for_all_cameras(episodes):
+def test_sb3s_own_network_and_one_for_all_cameras(episodes, tmp_path):
     two = [[({**seen, "other": seen[CAMERA][:, ::-1]}, *rest) for seen, *rest in steps] for steps in episodes]
     for step in (step for steps in two for step in steps):
         step[0]["other"] = step[0]["other"].repeat(2, axis=0).repeat(2, axis=1)
@@ -128,9 +128,43 @@ def test_sb3s_own_network_and_one_for_all_cameras(episodes):
     kwargs = dict(features_extractor_class=NatureCNN, features_extractor_kwargs=dict(features_dim=16))
     model = make_model(DT, data, policy_kwargs=kwargs).learn(1)
     assert [type(each) for each in model.policy.network.encoder.extractors] == [NatureCNN, NatureCNN]
+    model.save(tmp_path / "model")
+    assert DT.load(tmp_path / "model").policy_kwargs == {**model.policy_kwargs, "features_extractor_class": "NatureCNN"}
     shared = make_model(DT, data, policy_kwargs={**kwargs, "share_features_extractor": True}).learn(1)
     assert len(shared.policy.network.encoder.extractors) == 1
     assert shared.policy.observation_dim == model.policy.observation_dim == 3 + 2 * 16
+
+
+class Means(BaseFeaturesExtractor):
+    """Mean colours, as a user's own class."""
+
+    def __init__(self, observation_space: spaces.Box, features_dim: int = 3) -> None:
+        super().__init__(observation_space, features_dim)
+        self.linear = th.nn.Linear(observation_space.shape[0], features_dim)
+
+    def forward(self, images: th.Tensor) -> th.Tensor:
+        return self.linear(images.mean(dim=(2, 3)))
+
+
+def test_a_class_of_a_users_own_is_given_as_sb3_takes_it_and_comes_back_by_its_name(buffer, tmp_path):
+    kwargs = dict(features_extractor_class=Means, features_extractor_kwargs=dict(features_dim=4))
+    try:
+        model = make_model(DT, buffer, policy_kwargs=kwargs).learn(1)
+        model.save(tmp_path / "model")
+        loaded = DT.load(tmp_path / "model")
+        observation, _ = wrapped().reset(seed=0)
+        np.testing.assert_array_equal(*(each.predict(observation, deterministic=True)[0] for each in (model, loaded)))
+        again = DT.load(tmp_path / "model", policy_kwargs={**loaded.policy_kwargs, "features_extractor_class": Means})
+        assert again.policy_kwargs["features_extractor_class"] == "Means"
+    finally:
+        EXTRACTORS.pop("Means", None)
+    with pytest.raises(ValueError, match=r"features_extractor_class must be one of .*EXTRACTORS by its name, got 'Means'"):
+        DT.load(tmp_path / "model")
+    named_alike = type("NatureCNN", (Means,), {})
+    with pytest.raises(ValueError, match="NatureCNN is the name of a packaged class; call yours something else"):
+        make_model(DT, buffer, policy_kwargs=dict(features_extractor_class=named_alike))
+    with pytest.raises(ValueError, match="Linear is no subclass of SB3's BaseFeaturesExtractor"):
+        make_model(DT, buffer, policy_kwargs=dict(features_extractor_class=th.nn.Linear))
 
 
 def test_torchvisions_resnet_takes_weights_of_a_file(buffer, tmp_path):
