@@ -62,7 +62,7 @@ class Arrays(ABC):
         for name in names:
             if name in self.names:
                 return name
-        accepted = names[0] if len(names) == 1 else f"one of {', '.join(names)}"
+        accepted = names[0] if len(names) == 1 else f"called one of {', '.join(names)}"
         found = ", ".join(sorted(map(str, self.names))) or "nothing"
         cure = " Name the columns with observation_keys=[...] and action_keys=[...]." if self.are_columns else ""
         raise DatasetError(f"{self.source}: has no array {accepted}, only {found}.{cure}")

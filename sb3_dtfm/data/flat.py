@@ -167,9 +167,11 @@ def load_flat(
     with opened(dataset) as arrays:
         action_keys = list(action_keys or arrays.columns(ACTIONS))
         actions = _actions(arrays, action_keys, action_space)
-        keys = list(observation_keys or arrays.columns(OBSERVATIONS))
+        images = [name for name in arrays.names if str(name).startswith(STORED_IMAGE)]
+        alone = images and not arrays.has(OBSERVATIONS)
+        keys = list(observation_keys or ([] if alone else arrays.columns(OBSERVATIONS)))
         if observation_keys is None:
-            keys += [name for name in arrays.names if name.startswith(STORED_IMAGE)]
+            keys += images
             _warn_of_images(arrays, {*keys, *action_keys, *NOT_NEEDED}, len(actions))
         observations = _observations(arrays, keys, len(actions), observation_space)
         ends = _ends(arrays, len(actions), max_episode_steps)

@@ -272,7 +272,7 @@ def _of_arrays(
         found = [key for key in names if key in arrays]
         if not found:
             there = ", ".join(map(str, arrays)) or "nothing"
-            raise DatasetError(f"{where}: has no array one of {', '.join(names)}, only {there}.")
+            raise DatasetError(f"{where}: has no array called one of {', '.join(names)}, only {there}.")
         return arrays[found[0]]
 
     def flag(names: Sequence[str]) -> bool:

@@ -307,7 +307,9 @@ def _observations(demo: h5py.Group, where: str, n_steps: int, keys: tuple[str, .
     for key in keys:
         name = key if key in names else ALIASES.get(key, key)
         if name not in names:
-            raise DatasetError(f"{where}: has no observation {key!r}; available: {listed(group)}.")
+            raise DatasetError(
+                f"{where}: has no observation {key!r}; available: {listed(group)}. observation_keys=[...] chooses."
+            )
         array = read_hdf5(group, name, where)
         if array.ndim == 1:
             array = array[:, None]

@@ -143,6 +143,17 @@ def test_images_of_another_name_are_told_of(source, path):
     assert chosen.image_spaces == {}
 
 
+@pytest.mark.parametrize("source", [write, lambda path, **changes: arrays(**changes)], ids=["npz", "memory"])
+def test_images_may_be_all_that_is_observed(source, path):
+    frames = np.zeros((N, 6, 5, 3), np.uint8)
+    alone = source(path, **{"image:front": frames, "observations": None})
+    buffer = load_dataset(alone)
+    assert list(buffer.image_spaces) == ["front"]
+    assert not buffer.observations.any()
+    with pytest.raises(DatasetError, match=r"image:front .*float64"):
+        load_dataset(source(path, **{"image:front": frames / 255, "observations": None}))
+
+
 def test_arrays_that_are_not_read_may_hold_anything(path):
     """Neither memory nor Python is spent on them: a shape of 2**45 bytes, objects, and no array at all."""
     write(path, objects=np.array([len, {}], dtype=object))
@@ -177,7 +188,7 @@ def test_bounds_of_actions(path):
 REFUSED = {
     "no actions": (
         dict(actions=None),
-        "has no array one of actions, action, acts, only episode_ends, observations, rewards",
+        "has no array called one of actions, action, acts, only episode_ends, observations, rewards",
     ),
     "no ends": (
         dict(episode_ends=None),

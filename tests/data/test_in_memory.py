@@ -104,7 +104,7 @@ UNFIT = {
         [[(OBS[0], ACTS[0], 0.0)]],
         "episode 0 is a list; accepted are .*observation, action, reward, terminated",
     ),
-    "no actions": ([{"obs": OBS}], "episode 0: has no array one of actions, action, acts, only obs"),
+    "no actions": ([{"obs": OBS}], "episode 0: has no array called one of actions, action, acts, only obs"),
     "other actions": (
         [{"obs": OBS, "acts": ACTS}, {"obs": OBS, "acts": ACTS[:, :1]}],
         r"episode 1: actions have shape \(3, 1\)",
@@ -146,7 +146,7 @@ def test_an_unfit_episode_can_be_dropped_and_actions_clipped():
         assert load_dataset([good, bad], on_invalid="drop").n_episodes == 1
     with pytest.warns(UserWarning, match="2 of 3 episodes have been dropped"):
         assert load_dataset([{"obs": OBS}, {"obs": OBS, "acts": ACTS[:, 0]}, good], on_invalid="drop").n_episodes == 1
-    with pytest.raises(DatasetError, match="episode 1: has no array one of actions"):
+    with pytest.raises(DatasetError, match="episode 1: has no array called one of actions"):
         load_dataset([{"obs": OBS}] * 2, on_invalid="drop")
     assert load_dataset([{"obs": OBS, "acts": 9 * ACTS}], clip_actions=True).actions.abs().max() == 1.0
 

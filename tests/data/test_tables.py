@@ -54,7 +54,7 @@ def test_columns_by_how_they_begin_or_by_name(write):
     named = write({NAMES.get(name, name): column for name, column in COLUMNS.items()})
     check(load_dataset(named, **NAMED))
     with pytest.raises(
-        DatasetError, match=r"has no array one of actions.*Name the columns with observation_keys=\[...\] and"
+        DatasetError, match=r"has no array called one of actions.*Name the columns with observation_keys=\[...\] and"
     ):
         load_dataset(named)
 
@@ -98,7 +98,7 @@ UNFIT = {
     "a name twice": ("obs_0,obs_0,action\n1,2,3\n", "a name for each column is expected, each once"),
     "words": ("obs_0,action,done\nfar,0.5,1\n", "obs_0 hold object; real numbers are expected"),
     "a hole": ("obs_0,action,done,reward\n1,0.5,0,1\n,0.5,1,1\n", "episode 0, step 1: observations hold nan"),
-    "nothing": ("", "has no array one of actions, action, acts, only nothing"),
+    "nothing": ("", "has no array called one of actions, action, acts, only nothing"),
 }
 
 
