@@ -321,6 +321,8 @@ def check_vec_env(
     :param remedy: the line that wraps it, for messages
     :raises ValueError: no :class:`ReturnToGoWrapper` inside, or normalised or stacked observations
     """
+    if not isinstance(env, VecEnv):
+        raise ValueError(f"{name} is {env!r}, no vectorised environment: write {remedy}.")
     vec_normalize = unwrap_vec_normalize(env)
     if vec_normalize is not None and vec_normalize.norm_obs:
         raise ValueError(

@@ -69,7 +69,7 @@ class NoiseActionVecEnv(FrozenPolicyVecEnv):
         noise_dim = check_noise_actions(policy)
         if not policy.network.head.noise_decides:
             raise ValueError(
-                "flow_steps=1: one step of Euler ends at the mean action, from any noise; "
+                f"flow_steps={policy.acting_settings()['flow_steps']}: the model acts by a mean, from any noise; "
                 f"model.policy.set_acting(flow_steps={NOISE_SPACE_FLOW_STEPS}) leaves a choice."
             )
         return NoiseSpace(noise_dim, bound)

@@ -145,15 +145,19 @@ def load_agent(algo: str, model: str | Path, device: str) -> BaseAlgorithm:
         more = "" if importlib.util.find_spec("sb3_contrib") else '; sb3-contrib\'s (tqc, ...): pip install "sb3-dtfm[zoo]"'
         raise ValueError(f"Unknown algorithm {algo!r}; known are {known}{more}.")
     algorithm = known_algorithms()[algo.lower()]
-    _check_algorithm(algorithm, Path(model))
+    check_saved_by(algorithm, Path(model))
     leave_out = {"learning_rate": 0.0, "lr_schedule": lambda _: 0.0, "clip_range": lambda _: 0.0}
     kwargs: dict[str, Any] = {"buffer_size": 1} if issubclass(algorithm, OffPolicyAlgorithm) else {}
     return algorithm.load(model, device=device, custom_objects=leave_out, **kwargs)
 
 
-def _check_algorithm(asked: type[BaseAlgorithm], model: Path) -> None:
+def check_saved_by(asked: type[BaseAlgorithm], model: Path) -> None:
     """
     Refuse an agent of another algorithm.
+
+    :param asked: its class should be
+    :param model: zip file
+    :raises ValueError: it is none of this algorithm
 
     A file of Stable-Baselines3 does not name its class, but it holds the attributes by name, and the policy's module and
     docstring. They are nearest to those of the class that saved them, whichever version that was.

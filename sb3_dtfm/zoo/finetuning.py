@@ -8,7 +8,7 @@ from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
-from rl_zoo3.utils import get_latest_run_id
+from rl_zoo3.utils import ALGOS, get_latest_run_id
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback, EvalCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -22,6 +22,7 @@ from sb3_dtfm.finetuning import FINETUNED, FinetunedDTFM, NoiseActionVecEnv, Onl
 from sb3_dtfm.finetuning.noise_env import NOISE_SPACE_FLOW_STEPS
 from sb3_dtfm.finetuning.online import ACCEPTED
 from sb3_dtfm.policies import SequencePolicy
+from sb3_dtfm.recording.loading import check_saved_by
 from sb3_dtfm.zoo.arguments import UsageError, with_target_return
 from sb3_dtfm.zoo.manager import OF_RL_ZOO, OfflineExperimentManager
 from sb3_dtfm.zoo.resuming import EPISODES, StopSignals
@@ -104,8 +105,9 @@ def keep_one_action(policy: SequencePolicy, residual: bool) -> None:
     :param residual: whether residual actions are learned, not noise
     """
     if not residual and policy.network.head.noise_dim and not policy.network.head.noise_decides:
+        given = policy.acting_settings()["flow_steps"]
+        print(f"flow_steps={given} becomes {NOISE_SPACE_FLOW_STEPS}: the model acts by a mean, which no noise changes")
         policy.set_acting(flow_steps=NOISE_SPACE_FLOW_STEPS)
-        print(f"The model acts by one Euler step, which no noise changes: flow_steps={NOISE_SPACE_FLOW_STEPS} instead")
     if residual and policy.options.n_action_steps > 1:
         print(f"n_action_steps={policy.options.n_action_steps} becomes 1: a residual action is added to each action")
         policy.set_acting(n_action_steps=1)
@@ -179,6 +181,11 @@ class FinetunedManager(FinetuningManager):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        if self.trained_agent:
+            try:
+                check_saved_by(ALGOS[self.algo], Path(self.trained_agent))
+            except ValueError as error:
+                raise UsageError(f"-i: {error} It takes the agent.zip of a run of `finetune`.") from error
         self.finetuned = FinetunedDTFM.of(DTFM.load(self.base_file, device=self.device))
         name = Path(self.save_path).name.removeprefix(f"{self.env_name}_")
         uuid = name.lstrip("0123456789")

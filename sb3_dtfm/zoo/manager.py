@@ -147,12 +147,13 @@ class OfflineExperimentManager(ExperimentManager):
         if self.restored is not None:
             hyperparams = self.restored.check_config(self.config, hyperparams)
         self._check_settings(hyperparams)
+        if self.n_timesteps < 1 and "n_timesteps" not in hyperparams:
+            raise UsageError("n_timesteps: the settings have none; add it there, or give -n.")
+        hyperparams.setdefault("n_timesteps", self.n_timesteps)
         if self.algo not in ALGORITHMS:
             return hyperparams, saved
         self.evaluate_alike(hyperparams)
-        if self.n_timesteps < 1 and "n_timesteps" not in hyperparams:
-            raise UsageError("n_timesteps: the settings have none; add it there, or give -n.")
-        hyperparams = {"policy": POLICY_NAMES[0], "n_timesteps": self.n_timesteps, **with_policy_options(hyperparams)}
+        hyperparams = {"policy": POLICY_NAMES[0], **with_policy_options(hyperparams)}
         if self.learns_offline:
             wrappers = hyperparams.get("env_wrapper")
             hyperparams = {**hyperparams, "env_wrapper": with_target_return(find_target_return(wrappers), wrappers)}

@@ -122,7 +122,7 @@ def test_a_model_that_acts_by_its_mean_action_draws_in_noise_space(run, workplac
     model.policy.set_acting(flow_steps=1)
     model.save(run / "HalfCheetah-v5")
     assert main([*FINETUNE, "--model", str(run), "-params", *QUICK, "learning_starts:100"]) == 0
-    assert "which no noise changes: flow_steps=3 instead" in capsys.readouterr().out
+    assert "flow_steps=1 becomes 3: the model acts by a mean, which no noise changes" in capsys.readouterr().out
     finetuned = FinetunedDTFM.load(workplace / "logs/finetuned/HalfCheetah-v5_1/HalfCheetah-v5")
     assert finetuned.policy.acting_settings()["flow_steps"] == 3
 
@@ -280,6 +280,8 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
     untold = DTFM.load("alone")
     untold.target_return = None
     untold.save("untold")
+    SAC("MlpPolicy", "Pendulum-v1", buffer_size=1).save("agent")
+    (workplace / "mine.yml").write_text("default: {policy: MlpPolicy, n_steps: 8, batch_size: 8, n_timestep: 64}")
     wrong = "vec_env_wrapper:['stable_baselines3.common.vec_env.VecMonitor']"
     cases = {
         "--model nowhere": "nowhere does not exist; --model names a DTFM's zip file or its run's folder.",
@@ -295,6 +297,10 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
         "--resume logs/dtfm/HalfCheetah-v5_1 --seed 3": "takes no other arguments",
         f"--model {run} -params {wrong}": "expected sb3_dtfm.finetuning.NoiseActionVecEnv or",
         f"--model {run} -params use_sde:True": "its exploration depends on the state (use_sde)",
+        f"--model {run} --algo ppo -i agent.zip": "-i: agent.zip was saved by SAC, not by PPO (--algo). It takes",
+        f"--model {run} --algo sac -i untold.zip": "-i: untold.zip was saved by DTFM, not by SAC (--algo).",
+        f"--model {run} --algo ppo --conf-file mine.yml": "n_timestep (did you mean n_timesteps?): no hyperparameter",
+        f"--model {run} --algo ppo --conf-file mine.yml -n -1": "n_timesteps: the settings have none; add it there, or give",
         f"--model {run} -optimize": "-optimize: hyperparameters of finetune cannot be searched",
     }
     for arguments, message in cases.items():
