@@ -10,6 +10,7 @@ Falls and errors are counted in our simulation, and in a second one as it is and
     PYTHONPATH=studies python -m go1.contexts run rows.jsonl --second go1.xml --contexts 20 -n 3000 -params batch_size:64 \\
         learning_rate:0.002 "policy_kwargs:{'return_conditioning':False,'n_layers':2,'observation_scaling':'std'}"
     PYTHONPATH=studies python -m go1.contexts teacher rows.jsonl --second go1.xml --onnx go1_policy.onnx
+    PYTHONPATH=studies python -m go1.contexts finetuned rows.jsonl --second go1.xml --model best_model.zip
 
 Batches hold 256 windows of 1 or 5 steps, 64 of 20, and 26 of 50. A run that is there already is not repeated. Each appends a
 row for each simulation, which `go1.report` makes a table of.
@@ -34,6 +35,7 @@ from sb3_dtfm.cli.literals import key_value
 from sb3_dtfm.envs import ReturnToGoWrapper
 from sb3_dtfm.envs.go1 import ENV_ID, EPISODE_STEPS
 from sb3_dtfm.envs.go1.env import TeacherObservation
+from sb3_dtfm.finetuning import FinetunedDTFM
 from sb3_dtfm.recording.onnx_agent import OnnxAgent
 
 DATASETS = ["go1/teacher-v0", "go1/disturbed-v0", "go1/dragged-v0"]
@@ -204,6 +206,17 @@ def hide_actions(model: OfflineAlgorithm, everywhere: bool) -> None:
                 parameter.register_hook(mask.mul)
 
 
+def finetuned(options: argparse.Namespace) -> None:
+    """Judge a model that `sb3-dtfm finetune` wrote."""
+    model, counts = FinetunedDTFM.load(options.model, device="cpu"), episode_counts(options)
+    cell = {"algo": "finetuned", "label": options.label, "context_length": model.context_length, "seed": options.seeds[0]}
+    wrapper: Any = {f"{ReturnToGoWrapper.__module__}.ReturnToGoWrapper": {"target_return": model.target_return}}
+    told = {"n_timesteps": model.num_timesteps, "target_return": model.target_return}
+    told |= {"commit": provenance.commit(), "hardware": provenance.hardware(th.device("cpu"))}
+    for name, env_kwargs in missing(options.rows, cell, chosen_simulations(options), counts).items():
+        append(options.rows, {**cell, "simulation": name, **judge(model, env_kwargs, [wrapper], counts[name]), **told})
+
+
 def teacher(options: argparse.Namespace) -> None:
     """Judge the teacher, who is told the velocity."""
     cell, counts = {"algo": "teacher", "label": "", "context_length": 1, "seed": 0}, episode_counts(options)
@@ -226,7 +239,7 @@ def episode_counts(options: argparse.Namespace) -> dict[str, int]:
 def main() -> None:
     """See the top."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("run", "teacher"))
+    parser.add_argument("what", choices=("run", "teacher", "finetuned"))
     parser.add_argument("rows", type=Path, help="JSONL file to append to")
     parser.add_argument("--algo", choices=ALGORITHMS, default="dtfm")
     parser.add_argument("--contexts", type=int, nargs="+", default=[1, 5, 20, 50])
@@ -242,11 +255,12 @@ def main() -> None:
         "--simulations", choices=simulations(""), nargs="+", default=list(simulations("")), help="all by default"
     )
     parser.add_argument("--onnx", metavar="FILE", help="the teacher")
+    parser.add_argument("--model", metavar="FILE", help="the fine-tuned model")
     parser.add_argument("--episodes", type=int, default=100, help="in our simulation")
     parser.add_argument("--second-episodes", type=int, default=100, help="in the second one, of each kind")
     parser.add_argument("--models", type=Path, default=Path("logs/go1"), help="folder for the models")
     options = parser.parse_args()
-    {"run": run, "teacher": teacher}[options.what](options)
+    {"run": run, "teacher": teacher, "finetuned": finetuned}[options.what](options)
 
 
 if __name__ == "__main__":
