@@ -21,7 +21,8 @@ from sb3_dtfm.benchmark.report.figures import STYLES
 from sb3_dtfm.benchmark.report.statistics import wilson
 
 COLUMNS = (
-    *("algo", "label", "context_length", "seed", "simulation", "episodes", "falls", "error", "turn_error", "mean_return"),
+    *("algo", "label", "context_length", "seed", "simulation", "episodes", "falls", "error", "turn_error"),
+    *("speed_share", "mean_return"),
     *("datasets", "hide_actions", "target_return", "n_timesteps", "wall_s", "commit", "settings", "hardware"),
 )
 SIMULATIONS = tuple(simulations(""))

@@ -23,6 +23,8 @@ def test_errors_are_distances_from_the_command_that_held():
     off = np.array(velocities) - (0.3, -0.4, 0.5)
     expected = [np.hypot(off[:, 0], off[:, 1]).mean(), np.abs(off[:, 2]).mean()]
     np.testing.assert_allclose(env.errors, [expected])
+    along = np.sum(np.array(velocities)[:, :2] @ (0.3, -0.4))
+    np.testing.assert_allclose(env.walked, [[along, len(velocities) * 0.25]], atol=1e-12)
     env.reset(seed=1)
     assert len(env.errors) == 1
 
@@ -33,6 +35,7 @@ def test_a_teacher_that_stands_does_not_fall_and_one_that_kicks_does(tmp_path):
     row = judge(standing, {"randomize": False}, [TeacherObservation], 2)
     assert (row["episodes"], row["falls"]) == (2, 0)
     assert row["error"] > 0.1
+    assert abs(row["speed_share"]) < 0.05, "it stands"
     kicking = OnnxAgent(write_linear(tmp_path / "kick.onnx", np.full((48, 12), 5.0, np.float32)))
     row = judge(kicking, {}, [TeacherObservation], 2)
     assert row["falls"] == 2

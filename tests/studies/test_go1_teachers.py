@@ -3,7 +3,8 @@
 import itertools
 
 import numpy as np
-from go1.teachers import Damping, Drag, Dragged, Restless
+import pytest
+from go1.teachers import Damping, Drag, Dragged, Gentle, Moderate, Restless
 
 from sb3_dtfm.envs.go1.env import Go1Env
 
@@ -65,3 +66,14 @@ def test_restless_commands_hold_half_a_second():
         commands.append(tuple(observation[-3:]))
     n_changes = sum(one != two for one, two in itertools.pairwise(commands))
     assert 25 <= n_changes <= 70
+
+
+@pytest.mark.parametrize(("wrapper", "share"), [(Gentle, 1 / 3), (Moderate, 2 / 3)])
+def test_a_slow_teacher_is_told_a_share_of_the_command(wrapper, share):
+    """The robot's own observation, which is recorded, holds all of it."""
+    env = wrapper(Go1Env(randomize=False))
+    command = np.array([0.9, -0.3, 0.6])
+    for told in (env.reset(seed=0, options={"command": command})[0], env.step(np.zeros(12))[0]):
+        np.testing.assert_allclose(told[-3:], share * command, rtol=1e-6)
+        assert told.shape == (48,)
+    np.testing.assert_allclose(env.unwrapped.command, command)
