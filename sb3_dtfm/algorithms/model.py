@@ -27,6 +27,7 @@ from sb3_dtfm.algorithms.saving import (
     UnsavedSchedule,
     optimizer_tensors,
     optimizers,
+    saved_policy_kwargs,
     to_configuration,
 )
 from sb3_dtfm.arguments import NOT_NEGATIVE, POSITIVE, Number, Rule, check_arguments, with_nearest
@@ -44,7 +45,6 @@ from sb3_dtfm.files import ModelFile, ModelFileError, file_name, holds_pickles, 
 from sb3_dtfm.optimization import RunningMeans
 from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.policies.exported import ExportedPolicy
-from sb3_dtfm.policies.images import extractor_name
 
 # The names of an algorithm's one policy: Stable-Baselines3's for dictionaries, which it observes, for vectors and images.
 POLICY_NAMES = ("MultiInputPolicy", "MlpPolicy", "CnnPolicy")
@@ -107,7 +107,7 @@ class SequenceModel(BaseAlgorithm):
             self._get_policy_from_name(policy) if isinstance(policy, str) else policy,
             env,
             learning_rate,
-            policy_kwargs=_with_names(policy_kwargs),
+            policy_kwargs=saved_policy_kwargs(policy_kwargs),
             tensorboard_log=tensorboard_log,
             verbose=verbose,
             device=device,
@@ -288,7 +288,7 @@ class SequenceModel(BaseAlgorithm):
         :param allow_pickle: load files in SB3's format, whose pickles run code of their author: for files that you trust
         :param kwargs: attributes to change, `dataset` for example
         :raises ModelFileError: the file is damaged, pickled, of another algorithm, or holds what no model can have
-        :raises ValueError: an attribute out of range, or an environment that does not fit
+        :raises ValueError: an attribute out of range or of another name, or an environment that does not fit
         """
         if allow_pickle and holds_pickles(path):
             model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
@@ -317,7 +317,7 @@ class SequenceModel(BaseAlgorithm):
         saved = read_saved(path, cls.policy_aliases, custom_objects, get_device(device), print_system_info)
         attributes, source = saved.attributes, saved.source
         if "policy_kwargs" in changed:
-            changed = {**changed, "policy_kwargs": _with_names(changed["policy_kwargs"])}
+            changed = {**changed, "policy_kwargs": saved_policy_kwargs(changed["policy_kwargs"])}
         if changed.get("policy_kwargs", attributes.get("policy_kwargs")) != attributes.get("policy_kwargs"):
             raise ValueError(
                 f"policy_kwargs are what the weights of {source} were made with, {attributes.get('policy_kwargs')}, and "
@@ -458,11 +458,3 @@ class SequenceModel(BaseAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return [POLICY, *optimizers(self.policy)], []
-
-
-def _with_names(policy_kwargs: Any) -> Any:
-    """Arguments of the policy with the name of a class for images, as files have them."""
-    name = "features_extractor_class"
-    if not isinstance(policy_kwargs, dict) or name not in policy_kwargs:
-        return policy_kwargs
-    return {**policy_kwargs, name: extractor_name(policy_kwargs[name])}

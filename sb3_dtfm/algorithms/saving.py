@@ -15,6 +15,7 @@ from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, Line
 
 from sb3_dtfm.optimization import RunningMeans
 from sb3_dtfm.policies import SequencePolicy
+from sb3_dtfm.policies.images import extractor_name
 
 POLICY, OPTIMIZER, CRITIC_OPTIMIZER = "policy", "policy.optimizer", "policy.critic.optimizer"
 CRITIC_PREFIX = "critic."  # of the names of the critic's tensors among the optimiser's
@@ -26,7 +27,7 @@ ENCODED = {*SPACES, "policy_class", "learning_rate", "_means"}
 # Of `dataset_kwargs`: whoever loads a model says where a cache may lie and whether a pickle may run.
 NEVER_SAVED = ("cache_dir", "allow_pickle")
 # Of `features_extractor_kwargs`: a file that only the first training needs.
-EXTRACTOR_KWARGS, WEIGHTS = "features_extractor_kwargs", "weights"
+EXTRACTOR, EXTRACTOR_KWARGS, WEIGHTS = "features_extractor_class", "features_extractor_kwargs", "weights"
 
 
 class UnsavedSchedule:
@@ -65,17 +66,14 @@ def to_configuration(model: BaseAlgorithm, left_out: Iterable[str], wanted: Iter
     if attributes.get("dataset_kwargs"):
         kept = {name: value for name, value in attributes["dataset_kwargs"].items() if name not in NEVER_SAVED}
         attributes["dataset_kwargs"] = kept
-    policy_kwargs = attributes.get("policy_kwargs") or {}
-    if extractor := policy_kwargs.get(EXTRACTOR_KWARGS):
-        kept = {name: value for name, value in extractor.items() if name != WEIGHTS}
-        attributes["policy_kwargs"] = {**policy_kwargs, EXTRACTOR_KWARGS: kept}
+    attributes["policy_kwargs"] = _without_weights(attributes.get("policy_kwargs"))
     saved: dict[str, Any] = {}
     for name, value in attributes.items():
         try:
-            saved[name] = json.loads(json.dumps(value, allow_nan=False, default=_plain))
+            saved[name] = _json(value)
         except (TypeError, ValueError) as error:
             problem = f"{name} is no part of a saved model: it is a {type(value).__name__}, not plain values ({error})."
-            if name in wanted or name == "policy_kwargs":  # without which no file can be loaded
+            if name in wanted:
                 raise ValueError(problem) from error
             warnings.warn(problem, stacklevel=3)
     return {
@@ -86,6 +84,36 @@ def to_configuration(model: BaseAlgorithm, left_out: Iterable[str], wanted: Iter
         **{name: serialize_space(getattr(model, name)) for name in SPACES},
         "attributes": saved,
     }
+
+
+def saved_policy_kwargs(policy_kwargs: Any) -> Any:
+    """
+    Arguments of the policy as a file holds them: a class for images by its name, which is entered among the known.
+
+    :param policy_kwargs: as they were given
+    :raises ValueError: not all of them are plain values, without which no file could be loaded
+    """
+    if not isinstance(policy_kwargs, dict):
+        return policy_kwargs
+    if EXTRACTOR in policy_kwargs:
+        policy_kwargs = {**policy_kwargs, EXTRACTOR: extractor_name(policy_kwargs[EXTRACTOR])}
+    try:
+        _json(_without_weights(policy_kwargs))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"policy_kwargs: {error}; a model's file holds numbers, text, lists and dictionaries.") from error
+    return policy_kwargs
+
+
+def _without_weights(policy_kwargs: Any) -> Any:
+    """Arguments of the policy without the file of weights that an extractor began with."""
+    if not isinstance(policy_kwargs, dict) or not isinstance(policy_kwargs.get(EXTRACTOR_KWARGS), Mapping):
+        return policy_kwargs
+    kept = {name: value for name, value in policy_kwargs[EXTRACTOR_KWARGS].items() if name != WEIGHTS}
+    return {**policy_kwargs, EXTRACTOR_KWARGS: kept}
+
+
+def _json(value: Any) -> Any:
+    return json.loads(json.dumps(value, allow_nan=False, default=_plain))
 
 
 def _plain(value: Any) -> Any:

@@ -344,7 +344,7 @@ class TrajectoryBuffer(FlatSteps):
             return
         raise DatasetError(
             f"{self.source} was recorded in {self.env_id}, and the environment is {env_id}. If the data are meant for it, "
-            f"say so with dataset_kwargs={{'env_id': {env_id!r}}} (-params on the command line)."
+            f"say so with dataset_kwargs={{'env_id': {env_id!r}}} (-params or --dataset-kwargs on the command line)."
         )
 
     def select(self, episodes: np.ndarray) -> "TrajectoryBuffer":

@@ -26,6 +26,7 @@ from sb3_dtfm.data.flat import (
     check_shape,
     explain_range,
     fitted,
+    holds_episodes,
     load_flat,
     told_flags,
     warn_of_made_up_rewards,
@@ -50,7 +51,9 @@ def is_episodes(dataset: Any) -> bool:
 
 def is_steps(dataset: Any) -> bool:
     """Return whether this is a list of steps, of one or of several episodes."""
-    return is_episodes(dataset) and len(dataset) > 0 and _is_step(dataset[0])
+    if not is_episodes(dataset) or not len(dataset) or not _is_step(dataset[0]):
+        return False
+    return not (isinstance(dataset[0], Mapping) and holds_episodes(dataset[0]))
 
 
 def _is_step(found: Any) -> bool:
@@ -257,10 +260,12 @@ def _arrays_of_episode(episode: Any, where: str) -> Mapping[str, Any]:
 def _stacked(observations: Sequence[Any]) -> Any:
     """One observation after the other as (T, ...), dictionaries as a dictionary of such, tuples by the places of parts."""
     first = observations[0]
-    if isinstance(first, Mapping | tuple):
-        keys = first if isinstance(first, Mapping) else range(len(first))
-        return {key: _stacked([observation[key] for observation in observations]) for key in keys}
-    return np.stack([np.asarray(observation) for observation in observations]) if np.ndim(first) else np.array(observations)
+    if isinstance(first, Mapping):
+        return {key: _stacked([observation[key] for observation in observations]) for key in first}
+    if isinstance(first, tuple) and any(isinstance(part, Mapping | tuple) or np.ndim(part) for part in first):
+        parts = zip(*observations, strict=True)
+        return {place: _stacked(part) for place, part in enumerate(parts)}
+    return np.stack([np.asarray(observation) for observation in observations])
 
 
 def _of_arrays(

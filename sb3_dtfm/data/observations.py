@@ -109,6 +109,8 @@ def in_space(observations: Any, space: spaces.Space | None, where: str) -> np.nd
     :raises DatasetError: as :func:`as_vectors`, or not in the space
     """
     if isinstance(space, spaces.Dict | spaces.Tuple):
+        if isinstance(space, spaces.Tuple) and np.shape(observations)[1:] == (len(space),):  # a number for each part
+            observations = dict(enumerate(np.asarray(observations).T))
         if not isinstance(observations, Mapping):
             return as_vectors(observations, where)
         parts: dict[Any, spaces.Space] = dict(space.spaces if isinstance(space, spaces.Dict) else enumerate(space.spaces))

@@ -68,7 +68,7 @@ class Reader(NamedTuple):
 
 
 def is_several(dataset: Any) -> bool:
-    """Return whether this is a list of datasets, and not of episodes: one entry that can be no episode tells."""
+    """Return whether this is a list of datasets, by any entry that cannot be an episode."""
     return is_episodes(dataset) and any(_is_no_episode(each) for each in dataset)
 
 

@@ -29,7 +29,7 @@ OLD_LAYOUT_TOLERANCE = 1e-3  # metres
 
 
 def is_robomimic(dataset: Any) -> bool:
-    """Return whether this is the path of a hdf5 file, or a name that nothing else would have of what does not exist."""
+    """Return whether this is the path of an hdf5 file, or looks like a path where no file is."""
     if not isinstance(dataset, str | os.PathLike):
         return False
     path = os.path.expanduser(os.fspath(dataset))
@@ -308,7 +308,7 @@ def _observations(demo: h5py.Group, where: str, n_steps: int, keys: tuple[str, .
         name = key if key in names else ALIASES.get(key, key)
         if name not in names:
             raise DatasetError(
-                f"{where}: has no observation {key!r}; available: {listed(group)}. observation_keys=[...] chooses."
+                f"{where}: has no observation {key!r}; available: {listed(group)}. Choose with observation_keys=[...]."
             )
         array = read_hdf5(group, name, where)
         if array.ndim == 1:

@@ -69,8 +69,8 @@ class NoiseActionVecEnv(FrozenPolicyVecEnv):
         noise_dim = check_noise_actions(policy)
         if not policy.network.head.noise_decides:
             raise ValueError(
-                f"flow_steps={policy.acting_settings()['flow_steps']}: the model acts by a mean, from any noise; "
-                f"model.policy.set_acting(flow_steps={NOISE_SPACE_FLOW_STEPS}) leaves a choice."
+                f"flow_steps={policy.acting_settings()['flow_steps']}: the model takes its mean action, whatever the noise; "
+                f"call model.policy.set_acting(flow_steps={NOISE_SPACE_FLOW_STEPS})."
             )
         return NoiseSpace(noise_dim, bound)
 

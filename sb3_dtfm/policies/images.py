@@ -129,8 +129,8 @@ def extractor_name(given: Any) -> Any:
     """
     The name of an extractor, which a file can hold; a class of a user's own is entered in `EXTRACTORS`.
 
-    :param given: a class, or what is none already
-    :raises ValueError: no extractor of SB3's kind, or one that has the name of another
+    :param given: a class, or its name
+    :raises ValueError: no extractor of SB3's kind, or one with the name of a packaged one
     """
     if not isinstance(given, type):
         return given

@@ -348,7 +348,7 @@ def listed_settings(conf_file: str | None, env_id: str) -> dict[str, Any]:
         return {}
     entries = read_yaml(Path(conf_file))
     name = env_id if env_id in entries else "default"
-    settings = entries.get(name) or {}
+    settings = entries.get(name, {})
     if not isinstance(settings, dict):
         raise UsageError(f"{conf_file}: {name}: expected settings, found {settings!r:.40}.")
     return settings

@@ -106,7 +106,7 @@ def keep_one_action(policy: SequencePolicy, residual: bool) -> None:
     """
     if not residual and policy.network.head.noise_dim and not policy.network.head.noise_decides:
         given = policy.acting_settings()["flow_steps"]
-        print(f"flow_steps={given} becomes {NOISE_SPACE_FLOW_STEPS}: the model acts by a mean, which no noise changes")
+        print(f"flow_steps={given} becomes {NOISE_SPACE_FLOW_STEPS}: else the model takes its mean action")
         policy.set_acting(flow_steps=NOISE_SPACE_FLOW_STEPS)
     if residual and policy.options.n_action_steps > 1:
         print(f"n_action_steps={policy.options.n_action_steps} becomes 1: a residual action is added to each action")

@@ -321,7 +321,7 @@ class OfflineExperimentManager(ExperimentManager):
 
 def _as_schedule(name: str, value: Any) -> Any:
     """
-    What RL-Zoo reads: YAML takes 1e-3 for text, and so does it.
+    Turn text such as 1e-3, which YAML does not read as a number, into one.
 
     :raises UsageError: text that is neither a number nor a schedule
     """

@@ -10,7 +10,14 @@ Falls and errors are counted in our simulation, and in a second one as it is and
     PYTHONPATH=studies python -m go1.contexts run rows.jsonl --second go1.xml --contexts 20 -n 3000 -params batch_size:64 \\
         learning_rate:0.002 "policy_kwargs:{'return_conditioning':False,'n_layers':2,'observation_scaling':'std'}"
     PYTHONPATH=studies python -m go1.contexts teacher rows.jsonl --second go1.xml --onnx go1_policy.onnx
-    PYTHONPATH=studies python -m go1.contexts finetuned rows.jsonl --second go1.xml --model best_model.zip
+
+A student of go1/fast-v0 (see `go1.qualities`) and go1/disturbed-v0, 3,000 steps with the arguments above, was fine-tuned
+until an interrupt after 411,760 decisions:
+
+    sb3-dtfm finetune --model logs/go1/dtfm-student-20-0.zip --env Go1Velocity-v0 --env-kwargs model_file:"'go1.xml'" \\
+        --algo ppo -n 1000000
+    PYTHONPATH=studies python -m go1.contexts finetuned rows.jsonl --second go1.xml --label "student, residual" --seeds 0 \\
+        --model logs/finetuned/Go1Velocity-v0_1/Go1Velocity-v0.zip
 
 Batches hold 256 windows of 1 or 5 steps, 64 of 20, and 26 of 50. A run that is there already is not repeated. Each appends a
 row for each simulation, which `go1.report` makes a table of.

@@ -87,7 +87,7 @@ class Dragged(TeacherObservation):
 
 class Gentle(TeacherObservation):
     """
-    A teacher who is told a third of the command, and walks at a third of the speed.
+    A teacher who is told a third of the command.
 
     :param env: Go1Velocity-v0
     """

@@ -122,7 +122,7 @@ def test_a_model_that_acts_by_its_mean_action_draws_in_noise_space(run, workplac
     model.policy.set_acting(flow_steps=1)
     model.save(run / "HalfCheetah-v5")
     assert main([*FINETUNE, "--model", str(run), "-params", *QUICK, "learning_starts:100"]) == 0
-    assert "flow_steps=1 becomes 3: the model acts by a mean, which no noise changes" in capsys.readouterr().out
+    assert "flow_steps=1 becomes 3: else the model takes its mean action" in capsys.readouterr().out
     finetuned = FinetunedDTFM.load(workplace / "logs/finetuned/HalfCheetah-v5_1/HalfCheetah-v5")
     assert finetuned.policy.acting_settings()["flow_steps"] == 3
 

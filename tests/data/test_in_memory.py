@@ -422,6 +422,7 @@ def test_a_list_mixes_files_tables_buffers_and_arrays(tmp_path):
 
 TUPLES = {
     "a Box and a Discrete": spaces.Tuple((spaces.Box(-1, 1, (2,)), spaces.Discrete(3))),
+    "a MultiDiscrete, by tuples": spaces.MultiDiscrete([3, 4]),
     "Boxes": spaces.Tuple((spaces.Box(-1, 1, (2,)), spaces.Box(-1, 1, (3,)))),
     "Blackjack's": spaces.Tuple((spaces.Discrete(32), spaces.Discrete(11), spaces.Discrete(2))),
     "in a Dict": spaces.Dict(seen=spaces.Tuple((spaces.Box(-1, 1, (2,)), spaces.Discrete(3))), goal=spaces.Box(-1, 1, (1,))),
@@ -435,6 +436,8 @@ def test_tuple_observations_are_those_of_the_wrapper(kind, followed, nested):
     space = TUPLES[kind]
     space.seed(0)
     seen = [space.sample() for _ in range(7)]
+    if isinstance(space, spaces.MultiDiscrete):
+        seen = [tuple(map(int, each)) for each in seen]
     action = np.array([0.5])
     steps = [
         (before, action, after, 1.0, t == 5) if followed else (before, action, 1.0, t == 5, False)
@@ -444,3 +447,15 @@ def test_tuple_observations_are_those_of_the_wrapper(kind, followed, nested):
     expected = [spaces.flatten(sort_observation_space(space), each) for each in seen[:-1]]
     np.testing.assert_array_equal(buffer.observations[: len(expected)], np.float32(expected))
     assert buffer.rewards[:6].tolist() == [1.0] * 6
+
+
+def test_tuples_of_different_lengths_are_refused():
+    steps = [((np.zeros(2), *[0] * n), [0.5], 1.0, n == 2) for n in (1, 2)]
+    with pytest.raises(DatasetError, match="steps: cannot be read"):
+        load_dataset(steps, action_space=spaces.Box(-1, 1, (1,)))
+
+
+def test_arrays_of_single_numbers_in_a_list_are_no_steps():
+    arrays = {"obs": np.zeros(60), "actions": np.zeros(60), "episode_ends": [20, 40, 60]}
+    with pytest.warns(UserWarning, match="there is none of rewards"):
+        assert load_dataset([arrays], action_space=spaces.Box(-1, 1, (1,))).n_episodes == 3

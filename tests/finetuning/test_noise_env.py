@@ -227,5 +227,5 @@ def test_what_has_no_noise_to_choose_is_refused():
         NoiseActionVecEnv(make_venv(), _tiny(), bound=-1)
     mean_action = _tiny()
     mean_action.policy.set_acting(flow_steps=1)
-    with pytest.raises(ValueError, match=r"flow_steps=1: the model acts by a mean.*set_acting\(flow_steps=3\)"):
+    with pytest.raises(ValueError, match=r"flow_steps=1: the model takes its mean action.*set_acting\(flow_steps=3\)"):
         NoiseActionVecEnv(make_venv(), mean_action)

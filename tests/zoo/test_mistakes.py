@@ -65,6 +65,7 @@ CONF_FILES = [
     ("- a\n- b\n", "mine.yml: expected a mapping by task, found ['a', 'b']"),
     ("HalfCheetah-v5:\n\tpolicy: x\n", "mine.yml: is not YAML: while scanning"),
     ("HalfCheetah-v5: 3\n", "mine.yml: HalfCheetah-v5: expected settings, found 3"),
+    ("HalfCheetah-v5:\n", "mine.yml: HalfCheetah-v5: expected settings, found None"),
     ("default: [1]\n", "mine.yml: default: expected settings, found [1]"),
     (
         "default: {learning_rate: slow}\n",
