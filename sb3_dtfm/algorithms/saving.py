@@ -91,16 +91,18 @@ def saved_policy_kwargs(policy_kwargs: Any) -> Any:
     Arguments of the policy as a file holds them: a class for images by its name, which is entered among the known.
 
     :param policy_kwargs: as they were given
-    :raises ValueError: not all of them are plain values, without which no file could be loaded
+    :raises ValueError: those of such a class are no plain values, without which no file could be loaded
     """
     if not isinstance(policy_kwargs, dict):
         return policy_kwargs
     if EXTRACTOR in policy_kwargs:
         policy_kwargs = {**policy_kwargs, EXTRACTOR: extractor_name(policy_kwargs[EXTRACTOR])}
     try:
-        _json(_without_weights(policy_kwargs))
+        _json(_without_weights(policy_kwargs).get(EXTRACTOR_KWARGS))
     except (TypeError, ValueError) as error:
-        raise ValueError(f"policy_kwargs: {error}; a model's file holds numbers, text, lists and dictionaries.") from error
+        raise ValueError(
+            f"{EXTRACTOR_KWARGS}: {error}; a model's file holds numbers, text, lists and dictionaries."
+        ) from error
     return policy_kwargs
 
 

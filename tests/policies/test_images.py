@@ -161,7 +161,9 @@ def test_a_class_of_a_users_own_is_given_as_sb3_takes_it_and_comes_back_by_its_n
     with pytest.raises(ValueError, match=r"features_extractor_class must be one of .*EXTRACTORS by its name, got 'Means'"):
         DT.load(tmp_path / "model")
     kwargs["features_extractor_kwargs"] = dict(activation=th.nn.Tanh)
-    with pytest.raises(ValueError, match="policy_kwargs: type is not JSON; a model's file holds numbers, text, lists and"):
+    with pytest.raises(
+        ValueError, match="features_extractor_kwargs: type is not JSON; a model's file holds numbers, text, lists and"
+    ):
         make_model(DT, buffer, policy_kwargs=kwargs)
     EXTRACTORS.pop("Means", None)
     named_alike = type("NatureCNN", (Means,), {})
