@@ -100,13 +100,16 @@ def check_arguments(given: Mapping[str, Any], accepted: Mapping[str, Rule]) -> d
     return values
 
 
-def whole_timesteps(total_timesteps: Any) -> int:
+def whole_timesteps(total_timesteps: Any, reset_num_timesteps: bool) -> int:
     """
     :param total_timesteps: of `learn`; 1e5 is whole, too
-    :raises ValueError: no whole number of at least 0
+    :param reset_num_timesteps: whether they count from zero; else what is left of them may be below 0
+    :raises ValueError: no such number
     """
     whole = int(total_timesteps) if isinstance(total_timesteps, float) and total_timesteps.is_integer() else total_timesteps
-    check_arguments({"total_timesteps": whole}, {"total_timesteps": Number(low=0, whole=True)})
+    check_arguments(
+        {"total_timesteps": whole}, {"total_timesteps": Number(low=0 if reset_num_timesteps else -math.inf, whole=True)}
+    )
     return int(whole)
 
 

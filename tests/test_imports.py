@@ -76,6 +76,7 @@ PARTS = {
             "distributed",
             "files",
             "finetuning",
+            "recording",
             "zoo",
         },
     ),

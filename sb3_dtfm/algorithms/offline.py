@@ -293,7 +293,7 @@ class OfflineAlgorithm(SequenceModel):
             checkpoint; such a step changes no weight
         :raises MemoryError: a gradient step needs more than there is, with what decides how much that is
         """
-        total_timesteps = whole_timesteps(total_timesteps)
+        total_timesteps = whole_timesteps(total_timesteps, reset_num_timesteps)
         buffer = self.buffer or self._load_buffer()
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar

@@ -136,7 +136,7 @@ class OnlineDTFM(DTFM):
         :raises ValueError: no dataset, no environment, or an argument out of range
         :raises FloatingPointError: the loss or its gradient is no longer finite; such a step changes no weight
         """
-        total_timesteps = whole_timesteps(total_timesteps)
+        total_timesteps = whole_timesteps(total_timesteps, reset_num_timesteps)
         if self.env is None:
             raise ValueError("OnlineDTFM has no environment to act in: load(path, env, dataset=...) or set_env().")
         self._check_online(self.env)
