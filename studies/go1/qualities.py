@@ -38,7 +38,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("rows", type=Path, help="JSONL file to append to")
     parser.add_argument("--onnx", metavar="FILE", required=True, help="the teacher")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("-n", "--n-timesteps", type=int, default=3000, help="gradient steps")
     parser.add_argument("-params", nargs="+", type=key_value, metavar="KEY:VALUE", default=[], help="arguments of DTFM")
     parser.add_argument("--episodes", type=int, default=100)
