@@ -66,7 +66,8 @@ def to_configuration(model: BaseAlgorithm, left_out: Iterable[str], wanted: Iter
     if attributes.get("dataset_kwargs"):
         kept = {name: value for name, value in attributes["dataset_kwargs"].items() if name not in NEVER_SAVED}
         attributes["dataset_kwargs"] = kept
-    attributes["policy_kwargs"] = _without_weights(attributes.get("policy_kwargs"))
+    if "policy_kwargs" in attributes:
+        attributes["policy_kwargs"] = _without_weights(attributes["policy_kwargs"])
     saved: dict[str, Any] = {}
     for name, value in attributes.items():
         try:
@@ -88,7 +89,7 @@ def to_configuration(model: BaseAlgorithm, left_out: Iterable[str], wanted: Iter
 
 def saved_policy_kwargs(policy_kwargs: Any) -> Any:
     """
-    Arguments of the policy as a file holds them: a class for images by its name, which is entered among the known.
+    Arguments of the policy that a file can hold: of a class for images its name, by which it is entered among the known.
 
     :param policy_kwargs: as they were given
     :raises ValueError: those of such a class are no plain values, without which no file could be loaded

@@ -131,8 +131,6 @@ class OfflineExperimentManager(ExperimentManager):
             raise UsageError(f"n_envs must be {COUNT}, got {hyperparams['n_envs']!r}.")
         if self.n_timesteps < 1 and not Number(low=1).accepts(hyperparams.get("n_timesteps", 1)):
             raise UsageError(f"n_timesteps must be {COUNT}, got {hyperparams['n_timesteps']!r}; -n gives another one.")
-        for name in SCHEDULES & hyperparams.keys():
-            hyperparams[name] = _as_schedule(name, hyperparams[name])
         for name in CLASSES:
             given = hyperparams.get(name)
             for each in given if isinstance(given, list) else [given]:
@@ -147,6 +145,7 @@ class OfflineExperimentManager(ExperimentManager):
         if self.restored is not None:
             hyperparams = self.restored.check_config(self.config, hyperparams)
         self._check_settings(hyperparams)
+        hyperparams.update({name: _as_schedule(name, hyperparams[name]) for name in SCHEDULES & hyperparams.keys()})
         if self.n_timesteps < 1 and "n_timesteps" not in hyperparams:
             raise UsageError("n_timesteps: the settings have none; add it there, or give -n.")
         hyperparams.setdefault("n_timesteps", self.n_timesteps)

@@ -11,11 +11,11 @@ Falls and errors are counted in our simulation, and in a second one as it is and
         learning_rate:0.002 "policy_kwargs:{'return_conditioning':False,'n_layers':2,'observation_scaling':'std'}"
     PYTHONPATH=studies python -m go1.contexts teacher rows.jsonl --second go1.xml --onnx go1_policy.onnx
 
-A student of go1/fast-v0 (see `go1.qualities`) and go1/disturbed-v0, 3,000 steps with the arguments above, was fine-tuned
-until an interrupt after 411,760 decisions:
+A student of go1/fast-v0 (see `go1.qualities`) and go1/disturbed-v0, 150 episodes each, 3,000 steps with the arguments above,
+was fine-tuned until an interrupt after 411,760 decisions:
 
     sb3-dtfm finetune --model logs/go1/dtfm-student-20-0.zip --env Go1Velocity-v0 --env-kwargs model_file:"'go1.xml'" \\
-        --algo ppo -n 1000000
+        --algo ppo -n 1000000 --seed 0
     PYTHONPATH=studies python -m go1.contexts finetuned rows.jsonl --second go1.xml --label "student, residual" --seeds 0 \\
         --model logs/finetuned/Go1Velocity-v0_1/Go1Velocity-v0.zip
 

@@ -223,6 +223,8 @@ def test_what_has_no_noise_to_choose_is_refused():
         NoiseActionVecEnv(env, _tiny())
     with pytest.raises(ValueError, match=r"must be wrapped in sb3_dtfm.envs.ReturnToGoWrapper"):
         NoiseActionVecEnv(make_vec_env("HalfCheetah-v5"), _tiny())
+    with pytest.raises(ValueError, match=r"'HalfCheetah-v5', no vectorised environment: write make_vec_env\(env_id"):
+        NoiseActionVecEnv("HalfCheetah-v5", _tiny())
     with pytest.raises(ValueError, match="bound must be a number above 0, got -1"):
         NoiseActionVecEnv(make_venv(), _tiny(), bound=-1)
     mean_action = _tiny()
