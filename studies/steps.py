@@ -4,6 +4,7 @@ Time that a gradient step takes beside its matrix products alone: docs/performan
     OMP_NUM_THREADS=1 python studies/steps.py defaults             # what the data decide, a minute
     OMP_NUM_THREADS=1 python studies/steps.py sizes                # larger and smaller ones
     OMP_NUM_THREADS=1 python studies/steps.py sizes --before CHECKOUT --d3rlpy .venv-baselines/bin/python
+    OMP_NUM_THREADS=1 python studies/steps.py profile              # what the largest sizes spend their time on
 
 in turn with another version of this package, and with d3rlpy's Decision Transformer of the same width and depth, of which a
 step has 64 windows of 20 steps. Every measurement has a process of its own. Products are those that a step computes, of the
@@ -87,6 +88,15 @@ COLUMNS = {
 }  # fmt: skip
 HERE = Path(__file__).resolve().parents[1]
 PRODUCTS = [getattr(th.ops.aten, name).default for name in ("mm", "addmm", "bmm", "baddbmm")]
+# Kinds of operations in a profile, by beginnings of their names in PyTorch.
+KINDS = {
+    "products": ("mm", "addmm", "bmm", "baddbmm"),
+    "copies": ("copy_", "cat", "fill_", "zero_"),
+    "activations": ("gelu", "silu", "tanh", "_softmax"),
+    "layer norms": ("native_layer_norm",),
+    "sums, products and differences of elements": ("add", "sub", "mul", "div", "sum", "mean", "neg"),
+    "optimiser and average": ("_fused_adamw", "lerp", "_foreach", "linalg_vector_norm"),
+}
 
 
 class Products(TorchDispatchMode):
@@ -151,6 +161,20 @@ def measure(name: str, precision: str) -> dict[str, float]:
     return {"step": step, "products": min(before, after), "gflop": products.gflop()}
 
 
+def profile(name: str) -> dict[str, float]:
+    """Shares of a gradient step's processor time by `KINDS`, the first that fits; the rest is everything else."""
+    model = make_model(name)
+    model.learn(1, log_interval=None)
+    with th.profiler.profile(activities=[th.profiler.ProfilerActivity.CPU]) as profiled:
+        model.learn(4, log_interval=None)
+    times = {each.key.removeprefix("aten::"): each.self_cpu_time_total for each in profiled.key_averages()}
+    found = dict.fromkeys([*KINDS, "everything else"], 0.0)
+    for operation, time_spent in times.items():
+        fitting = (kind for kind, beginnings in KINDS.items() if operation.startswith(beginnings))
+        found[next(fitting, "everything else")] += time_spent
+    return {kind: time_spent / sum(times.values()) for kind, time_spent in found.items()}
+
+
 def run(name: str, checkout: Path, precision: str = "float32") -> dict[str, float]:
     """A measurement in a process of its own."""
     command = [sys.executable, __file__, "one", "--name", name, "--precision", precision]
@@ -192,7 +216,7 @@ def line(name: str, options: argparse.Namespace) -> str:
 def main() -> None:
     """See the top."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("defaults", "sizes", "one"))
+    parser.add_argument("what", choices=("defaults", "sizes", "profile", "one"))
     parser.add_argument("--before", type=Path, metavar="CHECKOUT")
     parser.add_argument("--d3rlpy", type=Path, metavar="PYTHON", help="of an environment that has d3rlpy")
     parser.add_argument("--repeats", type=int, default=3)
@@ -201,6 +225,10 @@ def main() -> None:
     options = parser.parse_args()
     if options.what == "one":
         print(json.dumps(measure(options.name, options.precision)))
+        return
+    if options.what == "profile":
+        for name in list(SIZES)[-2:]:
+            print(f"{name}: " + ", ".join(f"{kind} {share:.0%}" for kind, share in profile(name).items()))
         return
     print(f"| | {' | '.join(COLUMNS.values())} |")
     print("| --- " * (1 + len(COLUMNS)) + "|")

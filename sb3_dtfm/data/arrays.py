@@ -69,14 +69,15 @@ class Arrays(ABC):
 
     def columns(self, names: Sequence[str]) -> list[str]:
         """
-        The columns of a table that begin with the first of the names that any begins with: `obs_0`, `obs.x`, `obs[0]`; by
-        their numbers, where all have one.
+        The columns of a table that begin with the first of the names that any begins with: those with nothing but numbers
+        behind it, as `obs_0`, `obs[0]` or `obs_0_1`, by these numbers; or else all, as `obs.x`, but the next step's.
         """
         if self.are_columns and not self.has(names):
             for name in names:
-                if found := [each for each in self.names if re.match(rf"{name}[\W_\d]", each)]:
-                    numbers = [re.search(r"(\d+)\W*$", each) for each in found]
-                    return found if None in numbers else sorted(found, key=lambda each: int(re.findall(r"\d+", each)[-1]))
+                found = [each for each in self.names if re.match(rf"{name}[\W_\d]", each) and "next" not in each]
+                numbered = [each for each in found if re.fullmatch(rf"{name}[\W_\d]*\d[\W_]*", each)]
+                if found:
+                    return sorted(numbered, key=lambda each: list(map(int, re.findall(r"\d+", each)))) or found
         return [self.name(names)]
 
     def stored(self, name: str) -> Any:

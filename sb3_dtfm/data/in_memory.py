@@ -36,9 +36,10 @@ from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_space, wrap_dataset_errors
 from sb3_dtfm.envs.success import reported_success
 
-# What one step of an episode that was written down step by step holds: Gymnasium's, SB3's, and the shortest.
+# What one step of an episode that was written down step by step holds, in this order.
 STEP = ("observation", "action", "reward", "terminated", "truncated")
 SB3_STEP = ("observation", "action", "next_observation", "reward", "done")
+TEXTBOOK_STEP = ("observation", "action", "reward", "next_observation", "done")
 SHORT_STEP = ("observation", "action", "reward", "done")
 INFO = ("info", "infos")
 PARTS = (REWARDS, ACTIONS, OBSERVATIONS)
@@ -58,14 +59,23 @@ def is_steps(dataset: Any) -> bool:
 
 def _is_step(found: Any) -> bool:
     """Return whether this is one step: its reward is a number, or without a reward its action and observation are single."""
+    found = _by_name(found)
     if isinstance(found, Mapping):
-        given = (next((_n_axes(found[name]) for name in names if name in found), None) for names in PARTS)
-        reward, action, observation = given
-        return reward == 0 if reward is not None else action == 0 or action == observation == 1
+        reward, action, observation = (next((found[name] for name in names if name in found), None) for names in PARTS)
+        if reward is not None:
+            return _n_axes(reward) == 0
+        return action is not None and (_n_axes(action) == 0 or (_n_axes(action) == 1 and _is_single(observation)))
     if not is_episodes(found) or not len(found):
         return False
     parts = _parts(found)
     return len(parts) >= len(SHORT_STEP) and not isinstance(parts[-1], Mapping | Sequence) and np.size(parts[-1]) == 1
+
+
+def _is_single(observation: Any) -> bool:
+    """Return whether this is an observation of one step: a vector, an image, or a dictionary of such and of numbers."""
+    if isinstance(observation, Mapping):
+        return all(_n_axes(part) == 0 or _is_single(part) for part in observation.values())
+    return _n_axes(observation) == (3 if getattr(observation, "dtype", None) == np.uint8 else 1)
 
 
 def _n_axes(found: Any) -> int:
@@ -117,6 +127,7 @@ def load_steps(
 
 def _arrays_of_steps(steps: Sequence[Any], where: str) -> dict[str, Any]:
     """Arrays by the names of flat ones; of infos their success, and whether time ran out."""
+    steps = [_by_name(step) for step in steps]
     rows = steps if isinstance(steps[0], Mapping) else [_named(step) for step in steps]
     arrays: dict[str, Any] = {}
     for name in rows[0]:
@@ -134,6 +145,19 @@ def _arrays_of_steps(steps: Sequence[Any], where: str) -> dict[str, Any]:
     return arrays
 
 
+def _is_like(part: Any, observation: Any) -> bool:
+    """Return whether this is an observation, too, and no flag. Of observations that are numbers nothing tells."""
+    if isinstance(observation, Mapping | tuple):
+        return type(part) is type(observation)
+    return _n_axes(observation) > 0 and _shape(part) == _shape(observation) and np.asarray(part).dtype != bool
+
+
+def _by_name(step: Any) -> Any:
+    """A named tuple as the dictionary of its parts, if observations have one of their names; anything else as it is."""
+    fields = getattr(step, "_fields", ())
+    return step._asdict() if set(OBSERVATIONS) & set(fields) else step
+
+
 def _named(step: Sequence[Any]) -> dict[str, Any]:
     """A step's parts by their names."""
     infos = [part for part in step[len(SHORT_STEP) :] if isinstance(part, Mapping)]
@@ -144,6 +168,8 @@ def _named(step: Sequence[Any]) -> dict[str, Any]:
         told_apart = _n_axes(step[0]) > 0 or type(step[3]) is not type(step[4])
         followed = _shape(step[2]) == _shape(step[0]) and not isinstance(step[3], bool | np.bool_) and told_apart
         names = SB3_STEP if followed or isinstance(step[2], Mapping | tuple) else STEP
+        if not _n_axes(step[2]) and _is_like(step[3], step[0]):
+            names = TEXTBOOK_STEP
     found = {name: part for name, part in zip(names, parts, strict=True) if name != "next_observation"}
     return {**found, **({INFO[0]: infos[0]} if infos else {})}
 
@@ -169,7 +195,8 @@ def load_episodes(
     - a list of steps `(observation, action, reward, terminated, truncated)`, as they come from a Gymnasium environment:
       the observation that the action was chosen on, and what `env.step(action)` then returned, with the info, whose success
       is known of the episode, or without; or of `(observation, action, reward, done)`, of SB3's `(observation, action,
-      next_observation, reward, done)`, or of dictionaries of these
+      next_observation, reward, done)`, of `(observation, action, reward, next_observation, done)`, or of dictionaries or
+      named tuples of these
 
     Without rewards a success has a reward of 1 at its last step, and every episode is one where nothing tells.
 
@@ -250,7 +277,7 @@ def _arrays_of_episode(episode: Any, where: str) -> Mapping[str, Any]:
         return {**arrays, **({"rews": episode.rews} if hasattr(episode, "rews") else {})}
     if is_episodes(episode) and len(episode) and all(_is_step(step) for step in episode):
         return _arrays_of_steps(episode, where)
-    steps = "; ".join(", ".join(names) for names in (STEP, SB3_STEP, SHORT_STEP))
+    steps = "; ".join(", ".join(names) for names in (STEP, SB3_STEP, TEXTBOOK_STEP, SHORT_STEP))
     raise DatasetError(
         f"{where} is a {type(episode).__name__}; accepted are a dictionary of arrays, a Trajectory, a trajectory of "
         f"imitation, or a list of steps ({steps})."

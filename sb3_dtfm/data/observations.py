@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -150,6 +150,31 @@ def chosen(observations: Any, keys: Sequence[str], space: spaces.Space | None, w
 def part_of(space: spaces.Space | None, key: str) -> spaces.Space | None:
     """The space of an entry of dictionary observations, where it is known."""
     return space.spaces.get(key) if isinstance(space, spaces.Dict) else None
+
+
+def check_order(
+    keys: Sequence[str] | Mapping[str, str] | None, cameras: Collection[str], space: spaces.Space | None, source: str
+) -> None:
+    """
+    Compare the entries that were chosen with those of an environment, which shows all of its own, sorted by name.
+
+    :param keys: `observation_keys`; names of which the environment has none cannot be compared
+    :param cameras: those of them that are images
+    :param space: the environment's observation space, None if it is unknown
+    :param source: for messages
+    :raises DatasetError: they have another order than the environment's, or it has only some of them
+    """
+    if keys is None or not isinstance(space, spaces.Dict):
+        return
+    chosen = [key for key in (sorted(keys) if isinstance(keys, Mapping) else keys) if key not in cameras]
+    shown = [key for key in sorted(space.spaces) if key not in image_spaces(space)]
+    known = [key for key in chosen if key in shown]
+    renamed = isinstance(keys, Mapping)
+    if known != sorted(known) or (len(known) < len(chosen) and (known or renamed)):
+        raise DatasetError(
+            f"{source}: observation_keys {'name' if renamed else 'has'} {', '.join(chosen)}, in this order; the "
+            f"environment's entries of numbers are {', '.join(shown)}, in this one."
+        )
 
 
 class Chosen(NamedTuple):

@@ -27,6 +27,7 @@ from sb3_dtfm.data.in_memory import (
 )
 from sb3_dtfm.data.lerobot import fingerprint_lerobot, is_lerobot, load_lerobot
 from sb3_dtfm.data.minari import fingerprint_minari, is_minari, load_minari
+from sb3_dtfm.data.observations import check_order
 from sb3_dtfm.data.pickles import unpickled, without_pickles
 from sb3_dtfm.data.robomimic import fingerprint_robomimic, is_robomimic, load_robomimic
 from sb3_dtfm.data.trajectories import DatasetError
@@ -210,6 +211,7 @@ def load_dataset(
         buffer = load_cached(
             Path(cache_dir).expanduser(), fingerprint, lambda storage: reader.load(dataset, storage=storage, **kwargs)
         )
+    check_order(kwargs.get("observation_keys"), buffer.image_spaces, observation_space, buffer.source)
     if env_id is not None:
         buffer = copy.copy(buffer)
         buffer.env_id, buffer.controller = env_id, None

@@ -1,6 +1,7 @@
 """What is already in memory: lists of episodes and SB3's replay buffers."""
 
 import itertools
+from collections import namedtuple
 from dataclasses import dataclass
 from typing import Any
 
@@ -168,6 +169,7 @@ def done_steps(lengths=(4, 5, 2)):
     ]
 
 
+Transition = namedtuple("Transition", ["state", "action", "next_state", "done", "reward"])
 STEPS = {
     "dictionaries": lambda step: step,
     "Gymnasium": lambda step: (step["obs"], step["action"], step["reward"], step["done"], False),
@@ -182,6 +184,8 @@ STEPS = {
     "with done": lambda step: (step["obs"], step["action"], step["reward"], step["done"]),
     "with done and info": lambda step: (step["obs"], step["action"], step["reward"], step["done"], {}),
     "SB3": lambda step: (step["obs"], step["action"], step["obs"], step["reward"], step["done"]),
+    "textbook": lambda step: (step["obs"], step["action"], step["reward"], step["obs"] + 1, step["done"]),
+    "named tuples": lambda step: Transition(step["obs"], step["action"], step["obs"] + 1, step["done"], step["reward"]),
     "SB3 with arrays of one": lambda step: (
         *(step["obs"], step["action"], step["obs"]),
         *(np.array([step["reward"]]), np.array([step["done"]]), [{}]),
@@ -204,6 +208,37 @@ def test_steps_of_every_kind_are_read_alike(kind, nested):
     assert buffer.rewards.tolist() == [step["reward"] for step in given]
     assert buffer.terminated.tolist() == [True, True, False]
     assert np.isnan(buffer.successes).all() == (kind != "Gymnasium with info")
+
+
+@pytest.mark.parametrize("camera", [False, True])
+def test_demonstrated_steps_of_dictionary_observations_need_no_reward(camera):
+    """Neither episodes nor rewards tell that these are steps."""
+    frames = {"frame": np.zeros((8, 8, 3), np.uint8)} if camera else {"width": 0.5}
+    steps = [
+        {"observation": {"joints": np.float32([k, -k]), **frames}, "action": np.float32([0.1, 0.2]), "done": k in (3, 9)}
+        for k in range(10)
+    ]
+    with pytest.warns(UserWarning, match="every episode counts as one"):
+        buffer = load_dataset(steps)
+    assert buffer.episode_lengths.tolist() == [4, 6]
+    assert buffer.observations[:, 0].tolist() == list(range(10))
+    assert list(buffer.image_spaces) == (["frame"] if camera else [])
+
+
+def test_chosen_entries_have_the_order_of_the_environments():
+    """A Dict environment shows its entries sorted by name, whatever observation_keys says."""
+    space = spaces.Dict(arm=spaces.Box(-9, 9, (2,)), gripper=spaces.Box(-9, 9, (2,)))
+    arrays = {
+        **{name: np.full((8, 2), float(i)) for i, name in enumerate(("arm", "gripper", "other"))},
+        **dict(actions=np.zeros((8, 1)), rewards=np.ones(8), episode_ends=[4, 8]),
+    }
+    right = load_dataset(arrays, observation_space=space, observation_keys=["arm", "gripper"])
+    assert right.observations[0].tolist() == [0, 0, 1, 1]
+    for keys in (["gripper", "arm"], ["arm", "other"]):
+        with pytest.raises(DatasetError, match=rf"observation_keys has {', '.join(keys)}, .* numbers are arm, gripper, in"):
+            load_dataset(arrays, observation_space=space, observation_keys=keys)
+    named_otherwise = load_dataset({**arrays, "a": arrays["arm"]}, observation_space=space, observation_keys=["other", "a"])
+    assert named_otherwise.observations[0].tolist() == [2, 2, 0, 0]
 
 
 def test_steps_without_an_array_or_an_end_are_named():
