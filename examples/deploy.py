@@ -13,7 +13,8 @@ import zlib
 import numpy as np
 import onnxruntime
 
-TYPES = {"tensor(float)": np.float32, "tensor(int64)": np.int64, "tensor(bool)": np.bool_}
+TYPES = {"tensor(float)": np.float32, "tensor(int64)": np.int64, "tensor(bool)": np.bool_, "tensor(uint8)": np.uint8}
+KEPT = {"keys_values", "features"}  # what a call gives to the next one
 
 
 class Policy:
@@ -32,26 +33,36 @@ class Policy:
         self.inputs = {name: np.zeros(shape, dtype) for name, (shape, dtype) in shapes.items()}
         self.plan: list[np.ndarray] = []
 
-    def act(self, observation: np.ndarray, return_to_go: float, timestep: int) -> np.ndarray | np.int64:
+    def act(
+        self, observation: np.ndarray, return_to_go: float, timestep: int, images: dict[str, np.ndarray] | None = None
+    ) -> np.ndarray | np.int64:
         """
         The next action, as `predict(deterministic=True)` chooses it; time step 0 begins an episode.
 
         :param observation: (O,)
         :param return_to_go: target return less the rewards so far, or more where an episode is ahead of it
         :param timestep: counted from the episode's start
+        :param images: by camera, uint8 of (height, width, channels), or channels first
         :return: (A,) in the environment's range, or a number where its action space is Discrete
         """
+        for camera, shape in self.settings["images"].items():
+            image = (images or {})[camera]
+            self.inputs[camera][0] = image if list(image.shape) == shape else np.moveaxis(image, -1, 0)
         if timestep == 0:
             self.inputs["mask"][:], self.plan = False, []
             if "episode_keys" in self.inputs:
-                self.inputs["episode_keys"][:] = zlib.crc32(observation.astype(np.float32) + 0.0)  # no negative zeros
+                key = zlib.crc32(observation.astype(np.float32) + 0.0)  # no negative zeros
+                for camera in self.settings["images"]:
+                    key = zlib.crc32(self.inputs[camera], key)
+                self.inputs["episode_keys"][:] = key
         newest = {"observations": observation, "returns_to_go": return_to_go, "timesteps": timestep, "mask": True}
         for name, value in {**newest, "actions": 0.0}.items():
             self.inputs[name] = np.roll(self.inputs[name], -1, axis=1)
             self.inputs[name][:, -1] = value
-        if not self.plan or "keys_values" in self.inputs:  # what is kept grows with each step
+        if not self.plan or KEPT & set(self.inputs):  # what is kept grows with each step
             chunk, *kept = self.session.run(None, self.inputs)
-            self.inputs.update(zip(["keys_values"], kept, strict=False))
+            names = [each.name.removeprefix("next_") for each in self.session.get_outputs()[1:]]
+            self.inputs.update(zip(names, kept, strict=True))
             self.plan = self.plan or list(chunk[0, : self.settings["n_action_steps"]])
         self.inputs["actions"][:, -1] = action = self.plan.pop(0)
         first = self.settings["first_action"]
@@ -69,28 +80,27 @@ def main() -> None:
 
     import gymnasium
 
-    import sb3_dtfm.envs  # noqa: F401  (registers robosuite's tasks)
+    from sb3_dtfm.envs import ReturnToGoWrapper  # its import registers robosuite's tasks, too
 
     policy = Policy(options.policy)
     env_id = options.env or policy.settings["env_id"]
     target = policy.settings["target_return"] if options.target_return is None else options.target_return
     if env_id is None or target is None:
         parser.error("the file does not say for which task it is: give --env and --target-return")
-    env = gymnasium.make(env_id)
-    time_limit = env.spec.max_episode_steps
+    env = ReturnToGoWrapper(gymnasium.make(env_id), target)  # makes vectors, and counts what is left of the return
     for episode in range(options.episodes):
         observation, info = env.reset(seed=options.seed + episode)
-        return_to_go, timestep, done, milliseconds = target, 0, False, []
+        total, timestep, done, milliseconds = 0.0, 0, False, []
         while not done:
             start = time.perf_counter()
-            least = target * (1 - timestep / time_limit) if time_limit else -np.inf  # for an episode ahead of its target
-            action = policy.act(observation, max(return_to_go, least), timestep)
+            images = {camera: observation[camera] for camera in policy.settings["images"]}
+            action = policy.act(observation["observation"], observation["return_to_go"].item(), timestep, images)
             milliseconds.append((time.perf_counter() - start) * 1e3)
             observation, reward, terminated, truncated, info = env.step(action)
-            return_to_go, timestep, done = return_to_go - float(reward), timestep + 1, terminated or truncated
+            total, timestep, done = total + float(reward), timestep + 1, terminated or truncated
         success = f", success {info['is_success']}" if "is_success" in info else ""
         took = f"{np.mean(milliseconds):.2f} ms an action"
-        print(f"episode {episode}: {timestep} steps, return {target - return_to_go:g}{success}; {took}")
+        print(f"episode {episode}: {timestep} steps, return {total:g}{success}; {took}")
 
 
 if __name__ == "__main__":

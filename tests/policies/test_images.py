@@ -1,7 +1,7 @@
 """Images beside numbers: learned from as bytes, encoded once, and seen alike in data, environments and exported files."""
 
-import json
-import zlib
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +19,7 @@ from sb3_dtfm.policies.images import EXTRACTORS, N_CROPS, ResidualExtractor, spa
 from tests.algorithms.small import make_model
 from tests.images import CAMERA, make_pixels, record
 
+DEPLOY = Path(__file__).parents[2] / "examples" / "deploy.py"
 SMALL = dict(features_extractor_kwargs=dict(channels=(8, 8, 8), features_dim=8))
 BOUNDS = dict(action_bounds=(-2, 2))
 
@@ -200,29 +201,20 @@ def test_a_critic_values_what_images_show(buffer):
 
 
 def test_the_exported_file_acts_alike(buffer, tmp_path):
-    ort = pytest.importorskip("onnxruntime")
+    """By the example's loop, as a user would take it."""
+    pytest.importorskip("onnxruntime")
     model = make(DTFM, buffer).learn(2)
     model.export(tmp_path / "policy.onnx")
-    session = ort.InferenceSession(str(tmp_path / "policy.onnx"), providers=["CPUExecutionProvider"])
-    assert json.loads(session.get_modelmeta().custom_metadata_map["sb3_dtfm"])["images"] == {CAMERA: [3, 32, 32]}
-    types = {"tensor(float)": np.float32, "tensor(int64)": np.int64, "tensor(bool)": bool, "tensor(uint8)": np.uint8}
-    inputs = {each.name: np.zeros((1, *each.shape[1:]), types[each.type]) for each in session.get_inputs()}
+    policy = runpy.run_path(str(DEPLOY))["Policy"](str(tmp_path / "policy.onnx"))
+    assert policy.settings["images"] == {CAMERA: [3, 32, 32]}
     env = DummyVecEnv([wrapped])
     env.seed(0)
     observation, state, start = env.reset(), None, np.array([True])
     for timestep in range(5):
-        image = np.moveaxis(observation[CAMERA], 3, 1)
-        if timestep == 0:
-            inputs["episode_keys"][0] = zlib.crc32(image[0].tobytes(), zlib.crc32(observation["observation"][0] + 0.0))
-        newest = {"observations": observation["observation"], "returns_to_go": observation["return_to_go"][:, 0]}
-        for name, value in {**newest, "timesteps": timestep, "mask": True, "actions": 0.0}.items():
-            inputs[name] = np.roll(inputs[name], -1, axis=1)
-            inputs[name][:, -1] = value
-        inputs[CAMERA] = image
-        chunk, inputs["features"] = session.run(None, inputs)
+        seen = {name: values[0] for name, values in observation.items()}
+        acted = policy.act(seen["observation"], seen["return_to_go"].item(), timestep, {CAMERA: seen[CAMERA]})
         action, state = model.policy.predict(observation, state, start, deterministic=True)
-        np.testing.assert_allclose(chunk[:, 0], action, atol=1e-4)
-        inputs["actions"][:, -1] = action
+        np.testing.assert_allclose(acted, action[0], atol=1e-4)
         observation, *_ = env.step(action)
         start = np.array([False])
 
