@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import os
 import warnings
 from typing import Any, SupportsFloat
 
@@ -26,8 +27,12 @@ def register_gymnasium_robotics() -> None:
     is about the tasks that :func:`warn_of_reward` warns of.
     """
     with contextlib.redirect_stderr(io.StringIO()), contextlib.suppress(ImportError):
-        import gymnasium_robotics
-
+        try:
+            import gymnasium_robotics
+        except AttributeError as error:  # MuJoCo's, of a library for rendering that is missing
+            how = f"MUJOCO_GL={os.environ.get('MUJOCO_GL')}"
+            warnings.warn(f"MuJoCo cannot be imported with {how} ({error}): is its library installed?", stacklevel=2)
+            return
         gym.register_envs(gymnasium_robotics)
 
 

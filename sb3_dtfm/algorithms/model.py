@@ -161,7 +161,10 @@ class SequenceModel(BaseAlgorithm):
 
     @property
     def _policy_class(self) -> type[SequencePolicy]:
-        assert issubclass(self.policy_class, SequencePolicy)
+        if not issubclass(self.policy_class, SequencePolicy):
+            raise ValueError(
+                f"policy is {self.policy_class.__name__}, which belongs to another algorithm than {type(self).__name__}."
+            )
         return self.policy_class
 
     def _make_policy(self, ema: bool) -> SequencePolicy:

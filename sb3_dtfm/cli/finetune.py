@@ -46,6 +46,8 @@ def main(argv: Sequence[str]) -> None:
     import_packages(options.gym_packages if restored is None else [])
     if "-optimize" in rest or "--optimize-hyperparameters" in rest:
         raise UsageError("-optimize: hyperparameters of finetune cannot be searched; -params changes them.")
+    if options.dataset:
+        raise UsageError("--dataset: the DTFM's own dataset is taken; -params dataset:... names another for --algo dtfm.")
     config = options.conf_file or finetuning_config(options.algo)
     if options.gym_packages:
         rest += ["--gym-packages", *options.gym_packages]
@@ -74,6 +76,7 @@ def _parser() -> argparse.ArgumentParser:
     every = "timesteps between two evaluations; by default a tenth of all: steps with dtfm, else decisions"
     argument("--eval-freq", type=int, metavar="N", help=every)
     argument("--eval-episodes", type=int, default=20, metavar="N", help="of an evaluation; 20 by default")
+    argument("--dataset", help=argparse.SUPPRESS)
     argument("--gym-packages", nargs="+", default=[], help=argparse.SUPPRESS)
     argument("--resume", metavar="RUN", help="go on with an interrupted run of --algo dtfm, as logs/dtfm/HalfCheetah-v5_2")
     return parser

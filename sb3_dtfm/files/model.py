@@ -29,6 +29,7 @@ SYSTEM_INFO = "system_info.txt"
 SB3_VERSION = "_stable_baselines3_version"
 TENSORS_SUFFIX = ".safetensors"
 # Members of a file that Stable-Baselines3 itself, or an earlier version of this package, has written.
+PICKLED_DATA = "data"  # JSON, of which a part is pickled
 PICKLED = ("data", ".pth", ".pkl", ".pt")
 MAX_CONFIGURATION = 2**24  # bytes
 # Errors of a zip file that is damaged, encrypted, newer than zipfile, or points behind its own end.
@@ -190,12 +191,14 @@ class _Reader:
             self.fail("a member is there twice.")
         pickled = [name for name in self.infos if name.endswith(PICKLED)]
         if pickled:
+            if not (module := self._pickled_policy()).startswith(__package__.partition(".")[0]):
+                self.fail(f"saved by another algorithm than DT and DTFM: its policy is of {module}.")
             self.fail(
                 f"{', '.join(pickled)}: pickled, so loading could run code. If you trust the file, "
                 "load(path, allow_pickle=True).save(path) makes one without."
             )
         if CONFIGURATION not in self.infos:
-            self.fail(f"{CONFIGURATION} is missing.")
+            self.fail(f"no model of DT or DTFM: {CONFIGURATION} is missing.")
         try:
             configuration = json.loads(self._content(CONFIGURATION, MAX_CONFIGURATION), parse_constant=self._no_number)
         except ModelFileError:
@@ -209,6 +212,12 @@ class _Reader:
             newer = "; a newer version of sb3-dtfm wrote it" if isinstance(version, int) and version > FORMAT else ""
             self.fail(f"format {version!r}{newer}; {FORMAT} is accepted.")
         return configuration
+
+    def _pickled_policy(self) -> str:
+        """The module of the policy that Stable-Baselines3 has saved, which is not pickled; ours if nothing tells."""
+        with contextlib.suppress(KeyError, TypeError, ValueError, RecursionError):
+            return str(json.loads(self._content(PICKLED_DATA, MAX_CONFIGURATION))["policy_class"]["__module__"])
+        return __package__
 
     def _no_number(self, text: str) -> NoReturn:
         self.fail(f"{CONFIGURATION} holds {text}; numbers must be finite.")

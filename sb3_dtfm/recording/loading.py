@@ -42,12 +42,14 @@ class AgentFiles:
     :param env_kwargs: arguments of ``gymnasium.make``
     :param wrapper: puts around an environment what stood between it and the agent
     :param vec_normalize: file of the statistics that its observations were normalised with, where there is one
+    :param of_run: its run tells whether there is one
     """
 
     model: Path
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     wrapper: Callable[[gym.Env], gym.Env] | None = None
     vec_normalize: Path | None = None
+    of_run: bool = False
 
 
 def find_agent(model: str | Path, env_id: str) -> AgentFiles:
@@ -85,7 +87,7 @@ def _read_run(model: Path, run: Path) -> AgentFiles:
         if hyperparams.get(key):
             raise ValueError(f"{run / 'config.yml'}: {key} is {hyperparams[key]!r}; agents trained so cannot be recorded.")
     statistics = run / "vecnormalize.pkl" if hyperparams["normalize"] and holds_pickles(model) else None
-    return AgentFiles(model, dict(hyperparams["env_kwargs"]), get_wrapper_class(hyperparams), statistics)
+    return AgentFiles(model, dict(hyperparams["env_kwargs"]), get_wrapper_class(hyperparams), statistics, of_run=True)
 
 
 def find_wrapper(name: str) -> Callable[[gym.Env], gym.Env]:
@@ -209,7 +211,7 @@ def load_fitting_agent(
     if vec_normalize_path == NOT_NORMALIZED:
         return model, None
     if vec_normalize_path is None and files.vec_normalize is None:
-        if isinstance(model, BaseAlgorithm):
+        if isinstance(model, BaseAlgorithm) and not files.of_run:
             _check_not_normalized(model, files.model)
         return model, None
     return model, _load_vec_normalize(Path(vec_normalize_path or str(files.vec_normalize)), env)

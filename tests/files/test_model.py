@@ -15,6 +15,7 @@ import pytest
 import torch as th
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
+from stable_baselines3 import SAC
 from stable_baselines3.common.save_util import save_to_zip_file
 from stable_baselines3.common.utils import LinearSchedule
 
@@ -180,6 +181,13 @@ def test_a_pickled_model_runs_nothing_unless_it_is_trusted(saved, tmp_path):
             with pytest.raises(ModelFileError, match=r"evil.zip: data, .*pickled.*allow_pickle=True"):
                 load(tmp_path / "evil.zip")
     assert RAN == []
+    SAC("MlpPolicy", "Pendulum-v1", buffer_size=1).save(tmp_path / "agent.zip")
+    with pytest.raises(
+        ModelFileError, match=r"agent.zip: saved by another algorithm than DT and DTFM: its policy is of stable"
+    ):
+        DTFM.load(tmp_path / "agent.zip")
+    with pytest.raises(ValueError, match=r"policy is SACPolicy, which belongs to another algorithm than DTFM"):
+        DTFM.load(tmp_path / "agent.zip", allow_pickle=True)
     data = {key: value for key, value in vars(model).items() if key not in (*model._excluded_save_params(), "_means")}
     save_to_zip_file(tmp_path / "old.zip", data, model.get_parameters())
     trusted = DTFM.load(tmp_path / "old.zip", allow_pickle=True)

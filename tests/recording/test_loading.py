@@ -209,6 +209,17 @@ def test_an_agent_that_does_not_tell_whether_it_needs_statistics_is_warned_of(tm
         load_fitting_agent("sac", files, gym.make("Pendulum-v1"), None, "cpu")
 
 
+def test_a_run_tells_that_its_agent_needs_no_statistics(tmp_path: Path):
+    agent = normalized_agent(SAC, tmp_path, norm_obs=False).rename(tmp_path / "Pendulum-v1.zip")
+    (tmp_path / "Pendulum-v1").mkdir()
+    for name, content in {"config.yml": "{policy: MlpPolicy}", "args.yml": "{}"}.items():
+        (tmp_path / "Pendulum-v1" / name).write_text(content)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        _, statistics = load_fitting_agent("sac", find_agent(agent, "Pendulum-v1"), gym.make("Pendulum-v1"), None, "cpu")
+    assert statistics is None
+
+
 def test_statistics_of_something_else_are_refused(run: Path, tmp_path: Path, capsys):
     statistics = str(run / "Pendulum-v1" / "vecnormalize.pkl")  # of observations with the time, (4,)
     assert record(normalized_agent(PPO, tmp_path), "--vec-normalize", statistics) == 2

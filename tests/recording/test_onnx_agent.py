@@ -86,6 +86,11 @@ def test_an_agent_of_another_observation_is_refused(tmp_path, capsys):
 def test_a_file_that_is_no_policy_is_refused(tmp_path, capsys):
     assert record(write_linear(tmp_path / "two.onnx", n_inputs=2)) == 2
     assert "two.onnx must have one input (N, O) and an output (N, A), got x0 ['rows', 3], x1" in capsys.readouterr().err
+    graph = onnx.load(write_linear(tmp_path / "ours.onnx"))
+    graph.metadata_props.add(key="sb3_dtfm", value="{}")
+    onnx.save(graph, tmp_path / "ours.onnx")
+    assert record(tmp_path / "ours.onnx") == 2
+    assert "ours.onnx was exported by sb3-dtfm: name the model that it was made of" in capsys.readouterr().err
     (tmp_path / "text.onnx").write_text("no graph")
     assert record(tmp_path / "text.onnx") == 2
     assert "text.onnx is no ONNX file that can be run" in capsys.readouterr().err
