@@ -192,7 +192,7 @@ class _Reader:
         pickled = [name for name in self.infos if name.endswith(PICKLED)]
         if pickled:
             if not (module := self._pickled_policy()).startswith(__package__.partition(".")[0]):
-                self.fail(f"saved by another algorithm than DT and DTFM: its policy is of {module}.")
+                self.fail(f"saved by another algorithm: its policy is of {module}.")
             self.fail(
                 f"{', '.join(pickled)}: pickled, so loading could run code. If you trust the file, "
                 "load(path, allow_pickle=True).save(path) makes one without."
