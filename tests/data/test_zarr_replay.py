@@ -62,7 +62,38 @@ def test_the_environments_names_and_some_columns(arrays, tmp_path):
     assert (alone.observations == 0).all()
 
 
+@pytest.mark.parametrize(("name", "shape"), [("reward", (N,)), ("rewards", (N, 1))])
+def test_rewards_and_ends_are_read_where_they_are(name, shape, arrays, tmp_path, recwarn):
+    arrays[f"data/{name}"] = np.arange(N, dtype=np.float32).reshape(shape)
+    arrays["data/terminals"] = np.eye(1, N, 2)[0]
+    arrays["data/timeouts"] = np.eye(1, N, N - 1)[0] > 0
+    buffer = load_dataset(write(tmp_path / "push.zarr", arrays), action_bounds=(0, 512))
+    assert buffer.rewards.tolist() == list(range(N))
+    assert (buffer.terminated.tolist(), buffer.truncated.tolist()) == ([True, False], [False, True])
+    assert not [each for each in recwarn if "reward" in str(each.message)]
+
+
+@pytest.mark.parametrize("images", [True, False])
+def test_without_a_state_all_numbers_are_observed(images, arrays, tmp_path):
+    parts = {"data/gripper": np.arange(N, dtype=np.uint8)[:, None], "data/robot_eef_pose": arrays.pop("data/state")}
+    arrays |= {**parts, "data/timeouts": np.zeros(N, bool), "data/times": np.zeros(3)}
+    if not images:
+        del arrays["data/img"]
+    with pytest.warns(UserWarning, match=r"Not read: times\."):
+        buffer = load_dataset(write(tmp_path / "push.zarr", arrays), action_bounds=(0, 512))
+    np.testing.assert_array_equal(buffer.observations.numpy(), np.hstack(list(parts.values())))
+    assert set(buffer.image_spaces) == ({"img"} if images else set())
+
+
 REFUSED = {
+    "rewards": (
+        lambda arrays: arrays.update({"data/reward": np.zeros((N, 2))}),
+        r"reward has shape \(8, 2\), expected \(8,\)",
+    ),
+    "nothing to observe": (
+        lambda arrays: [arrays.pop(name) for name in ("data/img", "data/state")],
+        r"data has nothing to observe, only action\.",
+    ),
     "no ends": (lambda arrays: arrays.pop("meta/episode_ends"), r"has no meta/episode_ends"),
     "ends": (lambda arrays: arrays.update({"meta/episode_ends": np.array([3, 9])}), r"ascending .*, the last one 8"),
     "no actions": (
