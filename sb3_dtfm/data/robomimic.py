@@ -146,7 +146,8 @@ def _read(
         _check_count(data, "total", sum(demo.n_steps for demo in labels.values()), source)
     rewards = _rewards(labels)
     if not any(demo.rewards is not None and demo.rewards.any() for demo in labels.values()):
-        warn_of_made_up_rewards((), source)
+        all_zero = any(demo.rewards is not None for demo in labels.values())
+        warn_of_made_up_rewards((), source, "there is no reward but 0" if all_zero else "there are no rewards")
     env_id = _env_id(env_args, source, *meant_for)
     n_actions = next((labels[name].n_actions for name in demos if name in labels), None)
     if n_actions is None:
