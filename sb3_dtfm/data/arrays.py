@@ -231,7 +231,8 @@ class _Parquet(Arrays):
         table = self._file.read(columns=[name])
         table.validate(full=True)
         column = table[name].combine_chunks()
-        if import_pyarrow(where).types.is_nested(column.type):
+        pyarrow = import_pyarrow(where)
+        if pyarrow.types.is_nested(column.type) or isinstance(column, pyarrow.ExtensionArray):
             return as_numbers(column, where)
         return column.to_numpy(zero_copy_only=False)
 
