@@ -4,7 +4,7 @@ import json
 import os
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_flags, wr
 ACTION, REWARDS, SUCCESS, DONE = "action", ("next.reward", "reward"), "next.success", "next.done"
 OBSERVATION = "observation."
 PIXELS = Number(low=1, whole=True)
+EPISODE_NUMBER = Number(low=0, whole=True)
 # What numbers of a robot are stored as; words are others.
 NUMBERS = (
     "bool",
@@ -215,8 +216,10 @@ def _rewards(labels: dict[str, np.ndarray], reward: str, n_steps: int) -> tuple[
     return marks[: int(np.argmax(marks)) + 1 if marks.any() else n_steps].astype(float), bool(marks.any()), told
 
 
-def _places(episodes: Sequence[int], numbers: np.ndarray, source: str) -> list[int]:
+def _places(episodes: Any, numbers: np.ndarray, source: str) -> list[int]:
     """Return where some episodes are among the numbers of all."""
+    if isinstance(episodes, str) or not (isinstance(episodes, Iterable) and all(map(EPISODE_NUMBER.accepts, episodes))):
+        raise ValueError(f"episodes must be a list of whole numbers of at least 0, or None, got {episodes!r}.")
     place_of = {number: place for place, number in enumerate(numbers.tolist())}
     for number in episodes:
         if number not in place_of:

@@ -1,6 +1,7 @@
 """LeRobot's folders: written as its formats 2.1 and 3.0 describe them."""
 
 import json
+import re
 import time
 from pathlib import Path
 
@@ -194,6 +195,12 @@ def test_a_link_out_of_the_folder_is_refused(tmp_path):
     info.symlink_to(tmp_path / "other.json")
     with pytest.raises(DatasetError, match=r"info.json leads to .*other.json; links within .*arm are accepted"):
         load_dataset(path)
+
+
+@pytest.mark.parametrize("episodes", [1, "12", [0.5], ["a"], [[1]], [-1]])
+def test_episodes_that_are_no_list_of_numbers(episodes, tmp_path):
+    with pytest.raises(ValueError, match=rf"episodes must be a list of whole .*, or None, got {re.escape(repr(episodes))}"):
+        load_dataset(write(tmp_path / "arm", **{"next.reward": np.zeros(12)}), episodes=episodes)
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
