@@ -87,12 +87,15 @@ def _opened(path: Path) -> Iterator[Any]:
         yield zarr.open_group(path, mode="r")
         return
     with zipfile.ZipFile(path) as archive:
-        named = {name: partial(archive.read, name) for name in archive.namelist() if name.rpartition("/")[2] in METADATA}
+        names = archive.namelist()
+        named = {name: partial(archive.read, name) for name in names if name.rpartition("/")[2] in METADATA}
         for name in named:
             check_size(archive.getinfo(name).file_size, 0, f"{path}, {name}")
         _check_metadata({f"{path}, {name}": read for name, read in named.items()})
+    folders = {name.partition("/")[0] for name in names}
     with zarr.storage.ZipStore(path, mode="r") as store:
-        yield zarr.open_group(store, mode="r")
+        # All that is in a zip of a folder's parent is that folder.
+        yield zarr.open_group(store, mode="r", path="".join(folders) if len(folders) == 1 else None)
 
 
 def _check_metadata(read: Mapping[str, Callable[[], str | bytes]]) -> None:
@@ -164,13 +167,18 @@ def load_zarr(
             raise DatasetError(f"{source}: has no {ENDS}, which says where episodes end.")
         for name, array in {**data, ENDS: group[ENDS]}.items():
             check_size(math.prod(array.shape) * array.dtype.itemsize, n_stored, f"{source}: {name}")
-        ends = np.asarray(group[ENDS][:])
+        stored_ends = np.asarray(group[ENDS][:])
+        with np.errstate(invalid="ignore"):
+            ends = stored_ends.astype(np.int64)
         name = _first(data, ACTIONS)
         if name is None:
             raise DatasetError(f"{source}: data has no array {' or '.join(ACTIONS)}, only {', '.join(sorted(data))}.")
         n_steps = data[name].shape[0]
-        if ends.ndim != 1 or not len(ends) or (np.diff(ends, prepend=0) <= 0).any() or ends[-1] != n_steps:
-            raise DatasetError(f"{source}: {ENDS} is {ends}, expected ascending numbers of steps, the last one {n_steps}.")
+        ascending = ends.ndim == 1 and len(ends) and (ends == stored_ends).all() and (np.diff(ends, prepend=0) > 0).all()
+        if not ascending or ends[-1] != n_steps:
+            raise DatasetError(
+                f"{source}: {ENDS} is {stored_ends}, expected ascending whole numbers of steps, the last one {n_steps}."
+            )
         chosen = _chosen(data, observation_keys, n_steps, source)
         rewards = _first(data, REWARDS)
         if rewards is None:
@@ -178,7 +186,15 @@ def load_zarr(
             warn_of_made_up_rewards(set(data) - observed_arrays - set(SUCCESSES), source)
         elif data[rewards].shape not in ((n_steps,), (n_steps, 1)):
             raise DatasetError(f"{source}: {rewards} has shape {data[rewards].shape}, expected ({n_steps},).")
-        space = bounded_space(action_bounds, action_space, np.asarray(data[name][: ends[0]]), source)
+        # One number a step is a choice only where it can be.
+        numbers = isinstance(action_space, spaces.Box) or data[name].dtype.kind == "f"
+        alone = len(data[name].shape) == 1 and numbers and not isinstance(action_space, spaces.Discrete)
+
+        def actions_of(steps: slice) -> np.ndarray:
+            actions = np.asarray(data[name][steps])
+            return actions[:, None] if alone else actions
+
+        space = bounded_space(action_bounds, action_space, actions_of(slice(0, 1)), source)
 
         def trajectory(number: int) -> Trajectory:
             steps, where = slice(int(ends[number - 1]) if number else 0, int(ends[number])), f"episode {number}"
@@ -186,7 +202,7 @@ def load_zarr(
                        in chosen.items()}  # fmt: skip
             seen = observed(entries, list(entries), observation_space, f"{source}, {where}")
             length = steps.stop - steps.start
-            actions = fitted(np.asarray(data[name][steps]), space, clip_actions)
+            actions = fitted(actions_of(steps), space, clip_actions)
             if rewards is None:
                 marks = np.eye(1, length, length - 1)[0]
                 return Trajectory(seen.vectors, actions, marks, terminated=True, name=where, images=seen.images)
@@ -250,9 +266,11 @@ def _read(array: Any, steps: slice, columns: slice, where: str) -> np.ndarray:
     values = np.asarray(array[steps])
     if values.ndim != 4 or values.dtype == np.uint8:
         return values if columns == slice(None) else values.reshape(len(values), -1)[:, columns]
-    images = values.astype(np.uint8)
+    with np.errstate(invalid="ignore"):
+        images = values.astype(np.uint8)
     if not (images == values).all():
         raise DatasetError(
-            f"{where}: images of {values.dtype} hold others than whole numbers from 0 to 255; scale them and store uint8."
+            f"{where}: images of {values.dtype} hold others than whole numbers from 0 to 255; scale them and store uint8, "
+            "or name what else is observed, observation_keys=[...]."
         )
     return images

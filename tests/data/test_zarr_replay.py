@@ -43,7 +43,8 @@ def load(path, **kwargs):
 def test_a_folder_and_a_zip_hold_the_same_episodes(arrays, tmp_path):
     folder = write(tmp_path / "push.zarr", arrays)
     shutil.make_archive(str(folder), "zip", folder)
-    for path in (folder, tmp_path / "push.zarr.zip"):
+    shutil.make_archive(str(tmp_path / "from_outside.zarr"), "zip", tmp_path, "push.zarr")
+    for path in (folder, tmp_path / "push.zarr.zip", tmp_path / "from_outside.zarr.zip"):
         buffer = load(path)
         assert buffer.episode_lengths.tolist() == [3, 5]
         np.testing.assert_array_equal(buffer.observations.numpy(), arrays["data/state"])
@@ -85,7 +86,27 @@ def test_without_a_state_all_numbers_are_observed(images, arrays, tmp_path):
     assert set(buffer.image_spaces) == ({"img"} if images else set())
 
 
+def test_whole_floats_are_ends_and_a_float_is_an_action_of_one_number(arrays, tmp_path):
+    arrays |= {"data/action": arrays["data/action"][:, 0], "meta/episode_ends": np.array(ENDS, float)}
+    buffer = load(write(tmp_path / "push.zarr", arrays))
+    assert buffer.episode_lengths.tolist() == [3, 5]
+    assert buffer.action_space == spaces.Box(0, 512, (1,))
+    np.testing.assert_array_equal(buffer.actions[:, 0].numpy(), arrays["data/action"])
+    arrays["data/action"] = np.arange(N) % 3
+    path = write(tmp_path / "choices.zarr", arrays)
+    assert load_dataset(path, action_space=spaces.Box(0, 2, (1,))).actions[:, 0].tolist() == [0, 1, 2, 0, 1, 2, 0, 1]
+    assert load_dataset(path, action_space=spaces.Discrete(3)).actions[1].tolist() == [0, 1, 0]
+
+
 REFUSED = {
+    "half an end": (
+        lambda arrays: arrays.update({"meta/episode_ends": np.array([2.5, 8.0])}),
+        r"is \[2\.5 8\. *\], expected ascending whole numbers of steps, the last one 8",
+    ),
+    "no pixel": (
+        lambda arrays: arrays["data/img"].__setitem__(0, np.nan),
+        r"img: images of float32 hold .*; scale them and store uint8, or name what else is observed, observation_keys=",
+    ),
     "rewards": (
         lambda arrays: arrays.update({"data/reward": np.zeros((N, 2))}),
         r"reward has shape \(8, 2\), expected \(8,\)",
@@ -109,7 +130,7 @@ REFUSED = {
 }
 
 
-@pytest.mark.filterwarnings("ignore:.*every episode counts")
+@pytest.mark.filterwarnings("error", "ignore:.*every episode counts")
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_does_not_fit_is_refused_by_name(name, arrays, tmp_path):
     spoil, message = REFUSED[name]
