@@ -51,7 +51,7 @@ class Arrays(ABC):
 
     @abstractmethod
     def _get(self, name: str, where: str) -> np.ndarray:
-        """A whole array of numbers."""
+        """A whole array of numbers, or several by their names."""
 
     def has(self, names: Sequence[str]) -> bool:
         """Return whether there is one of these."""
@@ -89,7 +89,8 @@ class Arrays(ABC):
     def read(self, names: Sequence[str], n_steps: int | None = None) -> np.ndarray:
         """The first of the named arrays that is there: numbers, one entry a step."""
         name = self.name(names)
-        where, array = f"{self.source}: {name}", np.asarray(self.stored(name))
+        where, found = f"{self.source}: {name}", self.stored(name)
+        array = as_vectors(found, where) if isinstance(found, Mapping) else np.asarray(found)
         check_real(array.dtype, where)
         if n_steps is not None and array.shape[:1] != (n_steps,):
             raise DatasetError(f"{where} has shape {array.shape} and actions have {n_steps} steps.")
@@ -159,7 +160,7 @@ class _Npz(Arrays):
 
 
 class _Hdf5(Arrays):
-    """Arrays at the top of an opened hdf5 file."""
+    """Arrays at the top of an opened hdf5 file; observations may be a group of arrays."""
 
     def __init__(self, file: h5py.File, source: str) -> None:
         check_within(file, "infos", source)
@@ -168,8 +169,14 @@ class _Hdf5(Arrays):
         super().__init__(source, {*file, *within}, os.path.getsize(source))
         self._file = file
 
-    def _get(self, name: str, where: str) -> np.ndarray:
-        return read_hdf5(self._file, name, self.source)
+    def _get(self, name: str, where: str) -> Any:
+        check_within(self._file, name, self.source)
+        group = self._file.get(name)
+        if not isinstance(group, h5py.Group):
+            return read_hdf5(self._file, name, self.source)
+        parts = filter(None, (describe_hdf5(group, part, where) for part in group))  # several links may lead to one
+        check_size(sum(math.prod(shape) * dtype.itemsize for shape, dtype in parts), self.n_stored or 0, where)
+        return {part: read_hdf5(group, part, where) for part in group}
 
     def describe(self, name: str) -> tuple[tuple[int, ...], np.dtype] | None:
         return describe_hdf5(self._file, name, self.source)
@@ -190,12 +197,6 @@ class _InMemory(Arrays):
     def describe(self, name: str) -> tuple[tuple[int, ...], np.dtype] | None:
         found = self._arrays[name]
         return (found.shape, found.dtype) if isinstance(found, np.ndarray) else None
-
-    def read(self, names: Sequence[str], n_steps: int | None = None) -> np.ndarray:
-        name = self.name(names)
-        if isinstance(self._arrays[name], Mapping):
-            return as_vectors(self._arrays[name], f"{self.source}: {name}")
-        return super().read(names, n_steps)
 
 
 class _Table(Arrays):
@@ -232,7 +233,8 @@ class _Parquet(Arrays):
         table = self._file.read(columns=[name])
         table.validate(full=True)
         column = table[name].combine_chunks()
-        if import_pyarrow(where).types.is_nested(column.type):
+        pyarrow = import_pyarrow(where)
+        if pyarrow.types.is_nested(column.type) or isinstance(column, pyarrow.ExtensionArray):
             return as_numbers(column, where)
         return column.to_numpy(zero_copy_only=False)
 

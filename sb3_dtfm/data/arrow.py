@@ -10,12 +10,13 @@ from sb3_dtfm.data.trajectories import DatasetError, check_real
 
 def import_pyarrow(source: str) -> ModuleType:
     """
-    The package, with `dataset`, `parquet` and `types`.
+    The package, with `compute`, `dataset`, `parquet` and `types`.
 
     :param source: what is to be read, for the message
     :raises ImportError: not installed; says which extra installs it
     """
     try:
+        import pyarrow.compute
         import pyarrow.dataset
         import pyarrow.parquet
         import pyarrow.types
@@ -28,19 +29,21 @@ def as_numbers(values: Any, where: str) -> np.ndarray:
     """
     A column of a table.
 
-    :param values: a pyarrow Array whose entries are numbers, or lists of as many
+    :param values: a pyarrow Array whose entries are numbers, or lists of as many, which may hold further lists
     :param where: the file and the column, for messages
-    :return: (N, .)
+    :return: (N, .), all axes of a row as one
     :raises DatasetError: no rows, lists of several lengths, or no numbers
     """
     n_rows = len(values)
     if not n_rows:
         raise DatasetError(f"{where} has no rows; a row for each step is expected.")
     pyarrow = import_pyarrow(where)
-    if pyarrow.types.is_list(values.type) or pyarrow.types.is_fixed_size_list(values.type):
-        sizes = np.unique(np.diff(values.offsets.to_numpy())) if pyarrow.types.is_list(values.type) else np.zeros(1)
+    if isinstance(values, pyarrow.ExtensionArray):
+        values = values.storage
+    while hasattr(values, "flatten") and hasattr(values.type, "value_type"):  # a list of any kind
+        sizes = np.unique(pyarrow.compute.list_value_length(values).fill_null(0))
         if len(sizes) > 1:
-            raise DatasetError(f"{where} holds lists of {sizes[0]} to {sizes[-1]} numbers; one length is expected.")
+            raise DatasetError(f"{where} holds lists of {sizes[0]} to {sizes[-1]} entries; one length is expected.")
         values = values.flatten()
     array = values.to_numpy(zero_copy_only=False)
     check_real(array.dtype, where)

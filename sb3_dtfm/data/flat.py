@@ -42,12 +42,15 @@ LOW, HIGH = "action_low", "action_high"
 NOT_NEEDED = ("next_observations", "next_obs", "info", "infos", "metadata")
 
 
-def warn_of_made_up_rewards(names: Iterable[str], source: str) -> None:
+def warn_of_made_up_rewards(
+    names: Iterable[str], source: str, missing: str = f"there is none of {', '.join(REWARDS)}"
+) -> None:
     """
     Say what counts where there are no rewards, and which arrays may have been meant as rewards, or as ends.
 
     :param names: of all arrays
     :param source: for the message
+    :param missing: what the reader has looked for
     """
     names = set(names)
     if names & set(REWARDS):
@@ -60,9 +63,7 @@ def warn_of_made_up_rewards(names: Iterable[str], source: str) -> None:
         return
     counts = "so that a success is rewarded" if told else "nor any success, so that every episode counts as one, rewarded"
     not_read = f" Not read: {', '.join(unread)}." if unread else ""
-    warnings.warn(
-        f"{source}: there is none of {', '.join(REWARDS)}, {counts} by 1 at its last step.{not_read}", stacklevel=2
-    )
+    warnings.warn(f"{source}: {missing}, {counts} by 1 at its last step.{not_read}", stacklevel=2)
 
 
 def is_flat_file(dataset: Any) -> bool:

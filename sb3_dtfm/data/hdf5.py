@@ -56,6 +56,11 @@ def open_hdf5(
     try:
         data = h5py.h5d.open(group.id, name.encode())
     except (KeyError, TypeError, ValueError, OSError, RuntimeError) as error:  # no such name, a group, a link astray
+        with wrap_dataset_errors(what):
+            if group.get(name, getclass=True) is h5py.Group:
+                raise DatasetError(
+                    f"{what} is a group of {listed(group[name])}; an array of numbers is expected."
+                ) from error
         raise DatasetError(f"{where}: has no {name!r}, only {listed(group)}; the file is incomplete.") from error
     with wrap_dataset_errors(what):
         if not _stored_within(data):  # what is there can change without a trace, or be what nobody meant to give away

@@ -3,7 +3,8 @@
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,16 @@ from sb3_dtfm.data.lerobot_images import DATA, EPISODE, FRAME, IMAGE, INFO, TIME
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_flags, wrap_dataset_errors
 
-ACTION, REWARD, SUCCESS, DONE = "action", "next.reward", "next.success", "next.done"
+ACTION, REWARDS, SUCCESS, DONE = "action", ("next.reward", "reward"), "next.success", "next.done"
 OBSERVATION = "observation."
 PIXELS = Number(low=1, whole=True)
+EPISODE_NUMBER = Number(low=0, whole=True)
 # What numbers of a robot are stored as; words are others.
-NUMBERS = ("float32", "float64", "float16", "int64", "int32", "bool")
+NUMBERS = (
+    "bool",
+    *(f"float{n}" for n in (16, 32, 64)),
+    *(f"{kind}{n}" for kind in ("int", "uint") for n in (8, 16, 32, 64)),
+)
 
 
 def is_lerobot(dataset: Any) -> bool:
@@ -56,9 +62,9 @@ def load_lerobot(
     The episodes of a LeRobot dataset, of its formats 2.0 to 3.0: `meta/info.json`, and parquet files below `data`.
 
     The observation is made of all features whose names begin with `observation.`: vectors of numbers in the order of their
-    names, images, and the frames of videos at the steps' timestamps. Rewards are `next.reward`, or else 1 at the first step
-    of `next.success`, or else 1 at the last step of every episode. The numbers of all episodes are read into memory; images
-    are read episode by episode.
+    names, images, and the frames of videos at the steps' timestamps. Rewards are `next.reward` or `reward`, or else 1 at the
+    first step of `next.success`, or else 1 at the last step of every episode. The numbers of all episodes are read into
+    memory; images are read episode by episode.
 
     :param path: the folder
     :param observation_keys: which features make up the observation, in this order, as `observation.state`; or what the
@@ -82,12 +88,13 @@ def load_lerobot(
     names = _names(observation_keys, features, source)
     cameras = {name: key for name, key in names.items() if features[key] in (IMAGE, VIDEO)}
     vectors = [key for name, key in names.items() if name not in cameras]
-    labels = [name for name in (REWARD, SUCCESS, DONE, TIME) if features.get(name) in NUMBERS]
+    reward = next((name for name in REWARDS if features.get(name) in NUMBERS), REWARDS[0])
+    labels = [name for name in (reward, SUCCESS, DONE, TIME) if features.get(name) in NUMBERS]
     stored = Columns(folder, DATA, [*vectors, ACTION, *labels, EPISODE, FRAME], source)
     columns, n_frames, n_episodes = stored.numbers, info["total_frames"], info["total_episodes"]
     if len(stored) != n_frames:
         raise DatasetError(f"{source}: {INFO} tells of {n_frames} frames; there are {len(stored)}.")
-    _check_labels(columns, labels, source)
+    _check_labels(columns, labels, reward, source)
     size = None if image_size is None else _size(image_size)
     images = Cameras(folder, info, list(cameras.values()), stored.files, size, source)
     order = np.lexsort((columns[FRAME][:, 0], columns[EPISODE][:, 0]))
@@ -96,8 +103,8 @@ def load_lerobot(
     stops = np.append(starts[1:], len(order))
     if len(numbers) != n_episodes:
         raise DatasetError(f"{source}: {INFO} tells of {n_episodes} episodes; there are {len(numbers)}.")
-    if not {REWARD, SUCCESS} & set(labels):
-        warn_of_made_up_rewards((), source)
+    if not {reward, SUCCESS} & set(labels):
+        warn_of_made_up_rewards((), source, f"there is no feature {' or '.join(REWARDS)} of numbers")
     wanted = range(len(numbers)) if episodes is None else _places(episodes, numbers, source)
     actions = columns[ACTION]
     if action_bounds is None and action_space is None:
@@ -112,7 +119,7 @@ def load_lerobot(
         frames = columns[FRAME][steps, 0]
         if not np.array_equal(frames, np.arange(stop - start)):
             raise DatasetError(f"{source}, episode {number}: {FRAME} does not count its {stop - start} frames from 0 on.")
-        rewards, terminated, success = _rewards({name: columns[name][steps, 0] for name in labels}, stop - start)
+        rewards, terminated, success = _rewards({name: columns[name][steps, 0] for name in labels}, reward, stop - start)
         steps = slice(start, start + len(rewards))
         times = columns[TIME][steps, 0] if TIME in columns else frames[: len(rewards)] / info.get("fps", 1)
         return Trajectory(
@@ -158,6 +165,9 @@ def _names(keys: Sequence[str] | Mapping[str, str] | None, features: Mapping[str
     """The features that are observed, by the names that they have in the observation."""
     known = sorted(name for name, dtype in features.items() if dtype in (*NUMBERS, IMAGE, VIDEO))
     chosen = [name for name in known if name.startswith(OBSERVATION)] if keys is None else keys
+    unread = [f"{name} ({dtype})" for name, dtype in features.items() if name.startswith(OBSERVATION) and name not in known]
+    if keys is None and unread:
+        warnings.warn(f"{source}: neither numbers nor images, and not read: {', '.join(unread)}.", stacklevel=3)
     # The environment shows its entries in the order of their names.
     names = dict(sorted(chosen.items())) if isinstance(chosen, Mapping) else {name: name for name in chosen}
     for name in names.values():
@@ -178,35 +188,38 @@ def _size(size: Any) -> tuple[int, int]:
     return size[0], size[1]
 
 
-def _check_labels(columns: dict[str, np.ndarray], labels: Sequence[str], source: str) -> None:
+def _check_labels(columns: dict[str, np.ndarray], labels: Sequence[str], reward: str, source: str) -> None:
     """Refuse what is not one number a frame, and of the right kind."""
     for name in (*labels, EPISODE, FRAME):
         if columns[name].shape[1] != 1:
             raise DatasetError(f"{source}: {name} has {columns[name].shape[1]} numbers a frame; one is expected.")
-    for name in set(labels) - {REWARD, TIME}:
+    for name in set(labels) - {reward, TIME}:
         check_flags(columns[name], len(columns[name]), f"{source}: {name}")
     odd = columns[EPISODE] % 1 != 0
     if odd.any():
         raise DatasetError(f"{source}: {EPISODE} is {columns[EPISODE][odd][0]}; whole numbers are expected.")
 
 
-def _rewards(labels: dict[str, np.ndarray], n_steps: int) -> tuple[np.ndarray, bool, bool | None]:
+def _rewards(labels: dict[str, np.ndarray], reward: str, n_steps: int) -> tuple[np.ndarray, bool, bool | None]:
     """
     :param labels: (T,) each, of an episode, by the names of their columns
+    :param reward: the column of the rewards, if there is one
     :param n_steps: T
     :return: rewards of all steps, or up to the success; whether the task was done then, and whether it ever was
     """
     success = labels[SUCCESS] > 0 if SUCCESS in labels else None
     told = None if success is None else bool(success.any())
-    if REWARD in labels:
+    if reward in labels:
         ended = success if success is not None else labels.get(DONE, np.zeros(n_steps))
-        return labels[REWARD], bool(ended[-1]), told
+        return labels[reward], bool(ended[-1]), told
     marks = np.eye(1, n_steps, n_steps - 1)[0] if success is None else success
     return marks[: int(np.argmax(marks)) + 1 if marks.any() else n_steps].astype(float), bool(marks.any()), told
 
 
-def _places(episodes: Sequence[int], numbers: np.ndarray, source: str) -> list[int]:
+def _places(episodes: Any, numbers: np.ndarray, source: str) -> list[int]:
     """Return where some episodes are among the numbers of all."""
+    if isinstance(episodes, str) or not (isinstance(episodes, Iterable) and all(map(EPISODE_NUMBER.accepts, episodes))):
+        raise ValueError(f"episodes must be a list of whole numbers of at least 0, or None, got {episodes!r}.")
     place_of = {number: place for place, number in enumerate(numbers.tolist())}
     for number in episodes:
         if number not in place_of:

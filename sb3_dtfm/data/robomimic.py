@@ -4,7 +4,7 @@ import contextlib
 import json
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,14 +12,16 @@ import h5py
 import numpy as np
 from gymnasium import spaces
 
+from sb3_dtfm.actions import ActionSpace
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, existing_file
-from sb3_dtfm.data.flat import fitted, warn_of_made_up_rewards
+from sb3_dtfm.data.flat import bounded_space, explain_range, fitted, json_options, warn_of_made_up_rewards
 from sb3_dtfm.data.hdf5 import check_within, listed, open_group, open_hdf5, read_hdf5
 from sb3_dtfm.data.observations import Observed, is_images, observed
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_finite, check_flags, wrap_dataset_errors
 from sb3_dtfm.envs.robosuite import arm_controller, arm_motion, differences_in_motion, env_id_from_robomimic
+from sb3_dtfm.envs.robosuite.registration import ROBOSUITE_TYPE
 
 DEFAULT_OBSERVATION_KEYS = ("robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos", "object")
 EXPECTED = "the path of a robomimic hdf5 file"
@@ -52,8 +54,11 @@ def fingerprint_robomimic(path: str | os.PathLike[str], options: dict[str, Any])
     known = {name: options.pop(name, None) for name in ("env_id", "env_args")}  # which a cache does not hold
     with _opened(path) as (file, source):
         if "data" in set(file):
-            _env_id(_env_args(open_group(file, "data", source), source), source, **known)
-    return Fingerprint.of(Path(source).name, Path(source), options)
+            env_args = _env_args(open_group(file, "data", source), source)
+            _env_id(env_args, source, **known)
+            if _is_robosuite(env_args):
+                options.pop("action_space", None)
+    return Fingerprint.of(Path(source).name, Path(source), json_options(options))
 
 
 @contextlib.contextmanager
@@ -69,8 +74,10 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[h5py.File, str]]:
 def load_robomimic(
     path: str | os.PathLike[str],
     filter_key: str | None = None,
-    observation_keys: Sequence[str] | None = None,
+    observation_keys: Sequence[str] | Mapping[str, str] | None = None,
+    action_bounds: Sequence[Any] | None = None,
     clip_actions: bool = False,
+    action_space: ActionSpace | None = None,
     env_id: str | None = None,
     env_args: dict[str, Any] | None = None,
     on_invalid: str = "raise",
@@ -81,31 +88,38 @@ def load_robomimic(
 
     Rewards are those of :class:`~sb3_dtfm.envs.robosuite.RobosuiteEnv`, whose episode ends at the first success: where a
     file has rewards of 0 and 1 only, an episode is cut after its first 1, so that its return is 1 (robomimic's recordings
-    often go on for some steps), and is `terminated`. Without success it is `truncated` if the file marks its end as done.
+    often go on for some steps), and is `terminated`. Any other episode is `truncated` if the file marks its end as done.
     Where no episode of the file has any reward, or none has been stored, the first step that is done counts as the
-    success, or the last step if nothing is marked as done. Other rewards (dense ones) are kept as they are.
+    success, or the last step if nothing is marked as done. Other rewards (dense ones) are kept as they are, and
+    do not tell of success.
 
     The `object` observation of robosuite <= 1.4 is brought into the present form, which the environment shows too: Lift's
     gripper-to-cube vector had the opposite sign, and the two poses of Can, Square and the like the opposite order.
 
     :param path: the file
     :param filter_key: read only the demonstrations listed in `mask/<filter_key>`, such as "train"
-    :param observation_keys: which of a demonstration's `obs` make up the observation, in this order; robomimic's
-        low-dimensional ones by default
-    :param clip_actions: bring actions outside of the controller's input range to the nearest bound
+    :param observation_keys: which of a demonstration's `obs` make up the observation, in this order; or what
+        the environment calls each of them, `{"pixels": "agentview_image"}`; robomimic's low-dimensional ones by default
+    :param action_bounds: see :func:`~sb3_dtfm.data.load_flat`; only for files of other simulators than robosuite
+    :param clip_actions: bring actions outside of the range to the nearest bound
+    :param action_space: the environment's; robosuite's files tell of their range themselves
     :param env_id: the environment that the file's actions are meant for; not given, it is ours of the file's task, and a
         file of another robot or controller is refused
     :param env_args: `RobosuiteEnv.env_args` of the environment whose robot and controller have to be the file's; by default
         those of the registered ones
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
     :param storage: where the steps go, memory if not given
-    :return: actions in the controller's input range, [-1, 1] if the file says nothing else
+    :return: actions in the controller's input range, or in that of `action_bounds` or `action_space`; [-1, 1] if nothing
+        tells
     :raises DatasetError: no such file, not readable, nothing in it, unknown keys, wrong shapes, NaN or infinity, or actions
         out of range; names the file, the demonstration and the step
     """
-    keys = tuple(observation_keys or DEFAULT_OBSERVATION_KEYS)
+    keys = observation_keys or DEFAULT_OBSERVATION_KEYS
+    # The environment shows its entries in the order of their names.
+    names = dict(sorted(keys.items())) if isinstance(keys, Mapping) else {key: key for key in keys}
     with _opened(path) as (file, source):
-        return _read(file, source, filter_key, keys, clip_actions, (env_id, env_args), on_invalid, storage)
+        bounds = action_bounds, action_space
+        return _read(file, source, filter_key, names, bounds, clip_actions, (env_id, env_args), on_invalid, storage)
 
 
 class _Labels(NamedTuple):
@@ -121,7 +135,8 @@ def _read(
     file: h5py.File,
     source: str,
     filter_key: str | None,
-    observation_keys: tuple[str, ...],
+    observation_keys: dict[str, str],
+    bounds: tuple[Sequence[Any] | None, ActionSpace | None],
     clip_actions: bool,
     meant_for: tuple[str | None, dict[str, Any] | None],
     on_invalid: str,
@@ -144,14 +159,15 @@ def _read(
             refused[name] = error
     if not refused:
         _check_count(data, "total", sum(demo.n_steps for demo in labels.values()), source)
-    rewards = _rewards(labels)
+    rewards, tells_success = _rewards(labels)
     if not any(demo.rewards is not None and demo.rewards.any() for demo in labels.values()):
-        warn_of_made_up_rewards((), source)
+        all_zero = any(demo.rewards is not None for demo in labels.values())
+        warn_of_made_up_rewards((), source, "there is no reward but 0" if all_zero else "there are no rewards")
     env_id = _env_id(env_args, source, *meant_for)
     n_actions = next((labels[name].n_actions for name in demos if name in labels), None)
     if n_actions is None:
         raise refused[demos[0]]
-    action_space = _action_space(env_args, n_actions, source)
+    action_space = _action_space(env_args, n_actions, bounds, source)
 
     def trajectory(name: str) -> Trajectory:
         if name in refused:
@@ -160,29 +176,30 @@ def _read(
         with wrap_dataset_errors(where):
             length, dones = len(rewards[name]), labels[name].dones
             seen = _observations(groups[name], where, labels[name].n_steps, observation_keys)
-            success = bool(rewards[name][-1] >= 1.0)
+            success = bool(rewards[name][-1] == 1.0) if tells_success else None
             done = dones is not None and bool(dones[length - 1])
             return Trajectory(
-                observations=_present_object_state(seen.vectors, observation_keys, env_args)[:length],
+                observations=_present_object_state(seen.vectors, tuple(observation_keys.values()), env_args)[:length],
                 images=seen.first(length).images,
                 actions=fitted(read_hdf5(groups[name], "actions", where)[:length], action_space, clip_actions),
                 rewards=rewards[name],
-                terminated=success,
+                terminated=bool(success),
                 truncated=done and not success,
                 success=success,
                 name=name,
             )
 
-    buffer = TrajectoryBuffer.from_trajectories(
-        map(trajectory, demos),
-        action_space=action_space,
-        n_steps=sum(len(rewards[name]) for name in demos if name in rewards),
-        source=source,
-        env_id=env_id,
-        storage=storage,
-        on_invalid=on_invalid,
-        n_stored=os.path.getsize(source),
-    )
+    with contextlib.nullcontext() if _is_robosuite(env_args) else explain_range(action_space, *bounds):
+        buffer = TrajectoryBuffer.from_trajectories(
+            map(trajectory, demos),
+            action_space=action_space,
+            n_steps=sum(len(rewards[name]) for name in demos if name in rewards),
+            source=source,
+            env_id=env_id,
+            storage=storage,
+            on_invalid=on_invalid,
+            n_stored=os.path.getsize(source),
+        )
     buffer.controller = None if env_id is None else arm_motion(env_args)
     return buffer
 
@@ -278,13 +295,13 @@ def _labels(demo: h5py.Group, where: str) -> _Labels:
     return _Labels(rewards, dones, n_steps, n_actions)
 
 
-def _rewards(labels: dict[str, _Labels]) -> dict[str, np.ndarray]:
-    """Rewards as the environment gives them, cut after the first success; see :func:`load_robomimic`."""
+def _rewards(labels: dict[str, _Labels]) -> tuple[dict[str, np.ndarray], bool]:
+    """Rewards as the environment gives them, cut after the first success, and whether they tell of success."""
     stored = {
         name: np.zeros(demo.n_steps) if demo.rewards is None else demo.rewards.astype(float) for name, demo in labels.items()
     }
     if not all(np.isin(array, (0.0, 1.0)).all() for array in stored.values()):
-        return stored
+        return stored, False
     rewarded = any(array.any() for array in stored.values())
     rewards = {}
     for name, array in stored.items():
@@ -297,14 +314,14 @@ def _rewards(labels: dict[str, _Labels]) -> dict[str, np.ndarray]:
         length = int(successes[0]) + 1 if len(successes) else len(array)
         rewards[name] = np.zeros(length)
         rewards[name][-1] = 1.0
-    return rewards
+    return rewards, True
 
 
-def _observations(demo: h5py.Group, where: str, n_steps: int, keys: tuple[str, ...]) -> Observed:
-    """The chosen observations, vectors side by side and images by camera."""
+def _observations(demo: h5py.Group, where: str, n_steps: int, keys: dict[str, str]) -> Observed:
+    """The chosen observations by the environment's names, vectors side by side and images by camera."""
     group = open_group(demo, "obs", where)
     names, entries = set(group), {}
-    for key in keys:
+    for own, key in keys.items():
         name = key if key in names else ALIASES.get(key, key)
         if name not in names:
             raise DatasetError(
@@ -318,8 +335,8 @@ def _observations(demo: h5py.Group, where: str, n_steps: int, keys: tuple[str, .
                 f"{where}: observation {name!r} is {array.dtype} of shape {array.shape}, expected ({n_steps}, dimensions), "
                 f"one row for each action, or uint8 images ({n_steps}, height, width, channels)."
             )
-        entries[key] = array
-    return observed(entries, keys, None, where)
+        entries[own] = array
+    return observed(entries, list(entries), None, where)
 
 
 def _present_object_state(observations: np.ndarray, keys: tuple[str, ...], env_args: dict[str, Any]) -> np.ndarray:
@@ -357,9 +374,24 @@ def _in_frame(vectors: np.ndarray, quaternions: np.ndarray) -> np.ndarray:
     return np.asarray(vectors + scalars * crossed + np.cross(axes, crossed))
 
 
-def _action_space(env_args: dict[str, Any], n_actions: int, source: str) -> spaces.Box:
-    """The controller's input range for the arm, [-1, 1] for the gripper and where the file says nothing."""
+def _is_robosuite(env_args: dict[str, Any]) -> bool:
+    """Whether robosuite recorded a file: robomimic's number of it, or a task or a controller as robosuite has it."""
+    controller = arm_controller(env_args.get("env_kwargs", {}))
+    return bool(env_args.get("type") == ROBOSUITE_TYPE or env_id_from_robomimic(env_args) or controller)
+
+
+def _action_space(
+    env_args: dict[str, Any], n_actions: int, bounds: tuple[Sequence[Any] | None, ActionSpace | None], source: str
+) -> ActionSpace:
+    """The controller's input range for robosuite's arm, [-1, 1] for its gripper; others' range as :func:`bounded_space`."""
     with wrap_dataset_errors(f"{source}: attribute 'env_args' of group 'data'"):
+        if not _is_robosuite(env_args):
+            return bounded_space(*bounds, np.zeros((1, n_actions)), source)
+        if bounds[0] is not None:
+            raise DatasetError(
+                f"{source}: action_bounds is {bounds[0]!r}; robosuite's controller, which the file describes, has its own "
+                "range. Leave action_bounds out; clip_actions=True brings actions into that range."
+            )
         arm = arm_controller(env_args.get("env_kwargs", {}))
         if arm.get("input_type", "delta") != "delta" or arm.get("control_delta", True) is False:
             raise DatasetError(f"{source}: actions are absolute poses; only files with a delta controller are accepted.")

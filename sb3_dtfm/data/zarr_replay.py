@@ -19,7 +19,14 @@ from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, files_below
 from sb3_dtfm.data.flat import (
     ACTIONS,
+    DONES,
+    EPISODES,
+    NOT_NEEDED,
     OBSERVATIONS,
+    REWARDS,
+    SUCCESSES,
+    TERMINATIONS,
+    TRUNCATIONS,
     bounded_space,
     explain_range,
     fitted,
@@ -28,11 +35,13 @@ from sb3_dtfm.data.flat import (
 )
 from sb3_dtfm.data.observations import observed
 from sb3_dtfm.data.storage import FileStorage
-from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_size, wrap_dataset_errors
+from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_flags, check_size, wrap_dataset_errors
 
 SUFFIXES = (".zarr", ".zarr.zip")
 EXPECTED = "the path of a zarr replay buffer (.zarr, .zarr.zip)"
 ENDS = "meta/episode_ends"
+# Arrays that are not observed unless they are asked for.
+NOT_OBSERVED = {*ACTIONS, *REWARDS, *TERMINATIONS, *TRUNCATIONS, *DONES, *EPISODES, *SUCCESSES, *NOT_NEEDED}
 # Files that say how arrays are stored, and codecs that only compress: others, such as numcodecs' pickle, can run code.
 METADATA = (".zarray", ".zmetadata", "zarr.json")
 CODECS = {"blosc", "bytes", "bz2", "crc32c", "delta", "endian", "gzip", "lz4", "shuffle", "transpose", "zlib", "zstd"}
@@ -78,12 +87,15 @@ def _opened(path: Path) -> Iterator[Any]:
         yield zarr.open_group(path, mode="r")
         return
     with zipfile.ZipFile(path) as archive:
-        named = {name: partial(archive.read, name) for name in archive.namelist() if name.rpartition("/")[2] in METADATA}
+        names = archive.namelist()
+        named = {name: partial(archive.read, name) for name in names if name.rpartition("/")[2] in METADATA}
         for name in named:
             check_size(archive.getinfo(name).file_size, 0, f"{path}, {name}")
         _check_metadata({f"{path}, {name}": read for name, read in named.items()})
+    folders = {name.partition("/")[0] for name in names}
     with zarr.storage.ZipStore(path, mode="r") as store:
-        yield zarr.open_group(store, mode="r")
+        # All that is in a zip of a folder's parent is that folder.
+        yield zarr.open_group(store, mode="r", path="".join(folders) if len(folders) == 1 else None)
 
 
 def _check_metadata(read: Mapping[str, Callable[[], str | bytes]]) -> None:
@@ -129,11 +141,13 @@ def load_zarr(
     A folder, or a zip, of `data/action` (N, A), of images (N, height, width, channels) and vectors (N, .) in `data`, and of
     `meta/episode_ends` (E,). Images of floats with whole numbers from 0 to 255 become bytes. Episodes are read one by one.
 
-    There are no rewards: an episode counts as a success, with a reward of 1 at its last step.
+    Rewards are `data/rewards` or `data/reward`, (N,) or (N, 1), and episodes end as `data/terminals` and `data/timeouts`
+    say, if there are any. Without rewards an episode counts as a success, with a reward of 1 at its last step.
 
     :param path: of the folder or zip
     :param observation_keys: which arrays of `data` make up the observation; or what the environment calls each of them, with
-        some of its columns: `{"pixels": "img", "agent_pos": "state[:2]"}`. By default all images, and `state` or `obs`
+        some of its columns: `{"pixels": "img", "agent_pos": "state[:2]"}`. By default all images, and `state` or
+        `obs`, or else everything that has N steps and is no action, reward or end
     :param action_bounds: see :func:`~sb3_dtfm.data.load_flat`
     :param clip_actions: see :func:`~sb3_dtfm.data.load_flat`
     :param action_space: see :func:`~sb3_dtfm.data.load_flat`
@@ -153,16 +167,34 @@ def load_zarr(
             raise DatasetError(f"{source}: has no {ENDS}, which says where episodes end.")
         for name, array in {**data, ENDS: group[ENDS]}.items():
             check_size(math.prod(array.shape) * array.dtype.itemsize, n_stored, f"{source}: {name}")
-        ends = np.asarray(group[ENDS][:])
-        name = next((each for each in ACTIONS if each in data), None)
+        stored_ends = np.asarray(group[ENDS][:])
+        with np.errstate(invalid="ignore"):
+            ends = stored_ends.astype(np.int64)
+        name = _first(data, ACTIONS)
         if name is None:
             raise DatasetError(f"{source}: data has no array {' or '.join(ACTIONS)}, only {', '.join(sorted(data))}.")
         n_steps = data[name].shape[0]
-        if ends.ndim != 1 or not len(ends) or (np.diff(ends, prepend=0) <= 0).any() or ends[-1] != n_steps:
-            raise DatasetError(f"{source}: {ENDS} is {ends}, expected ascending numbers of steps, the last one {n_steps}.")
-        chosen = _chosen(data, observation_keys, name, n_steps, source)
-        warn_of_made_up_rewards((), source)
-        space = bounded_space(action_bounds, action_space, np.asarray(data[name][: ends[0]]), source)
+        ascending = ends.ndim == 1 and len(ends) and (ends == stored_ends).all() and (np.diff(ends, prepend=0) > 0).all()
+        if not ascending or ends[-1] != n_steps:
+            raise DatasetError(
+                f"{source}: {ENDS} is {stored_ends}, expected ascending whole numbers of steps, the last one {n_steps}."
+            )
+        chosen = _chosen(data, observation_keys, n_steps, source)
+        rewards = _first(data, REWARDS)
+        if rewards is None:
+            observed_arrays = {array for array, _ in chosen.values()}
+            warn_of_made_up_rewards(set(data) - observed_arrays - set(SUCCESSES), source)
+        elif data[rewards].shape not in ((n_steps,), (n_steps, 1)):
+            raise DatasetError(f"{source}: {rewards} has shape {data[rewards].shape}, expected ({n_steps},).")
+        # One number a step is a choice only where it can be.
+        numbers = isinstance(action_space, spaces.Box) or data[name].dtype.kind == "f"
+        alone = len(data[name].shape) == 1 and numbers and not isinstance(action_space, spaces.Discrete)
+
+        def actions_of(steps: slice) -> np.ndarray:
+            actions = np.asarray(data[name][steps])
+            return actions[:, None] if alone else actions
+
+        space = bounded_space(action_bounds, action_space, actions_of(slice(0, 1)), source)
 
         def trajectory(number: int) -> Trajectory:
             steps, where = slice(int(ends[number - 1]) if number else 0, int(ends[number])), f"episode {number}"
@@ -170,9 +202,22 @@ def load_zarr(
                        in chosen.items()}  # fmt: skip
             seen = observed(entries, list(entries), observation_space, f"{source}, {where}")
             length = steps.stop - steps.start
-            actions = fitted(np.asarray(data[name][steps]), space, clip_actions)
-            rewards = np.eye(1, length, length - 1)[0]
-            return Trajectory(seen.vectors, actions, rewards, terminated=True, name=where, images=seen.images)
+            actions = fitted(actions_of(steps), space, clip_actions)
+            if rewards is None:
+                marks = np.eye(1, length, length - 1)[0]
+                return Trajectory(seen.vectors, actions, marks, terminated=True, name=where, images=seen.images)
+            terminal, timeout, done = (
+                _ended(data, names, steps, f"{source}, {where}") for names in (TERMINATIONS, TRUNCATIONS, DONES)
+            )
+            return Trajectory(
+                seen.vectors,
+                actions,
+                np.asarray(data[rewards][steps]).reshape(-1),
+                terminated=terminal or (done and not timeout),
+                truncated=timeout,
+                name=where,
+                images=seen.images,
+            )
 
         with explain_range(space, action_bounds, action_space):
             return TrajectoryBuffer.from_trajectories(
@@ -181,14 +226,27 @@ def load_zarr(
             )  # fmt: skip
 
 
+def _first(data: Mapping[str, Any], names: Sequence[str]) -> str | None:
+    return next((name for name in names if name in data), None)
+
+
+def _ended(data: Mapping[str, Any], names: Sequence[str], steps: slice, where: str) -> bool:
+    """Whether the first of these arrays marks the last step of an episode."""
+    name = _first(data, names)
+    return name is not None and bool(check_flags(data[name][steps], steps.stop - steps.start, f"{where}: {name}")[-1])
+
+
 def _chosen(
-    data: Mapping[str, Any], keys: Sequence[str] | Mapping[str, str] | None, actions: str, n_steps: int, source: str
+    data: Mapping[str, Any], keys: Sequence[str] | Mapping[str, str] | None, n_steps: int, source: str
 ) -> dict[str, tuple[str, slice]]:
     """The array and its columns of each entry of the observation."""
     if keys is None:
         images = [name for name, array in data.items() if len(array.shape) == 4]
-        vectors = [name for name in OBSERVATIONS if name in data][:1]
-        keys = [*images, *vectors] or [name for name in data if name != actions]
+        vector = _first(data, OBSERVATIONS)
+        others = {name for name, array in data.items() if array.shape[:1] == (n_steps,)} - NOT_OBSERVED - set(images)
+        keys = [*images, *(sorted(others) if vector is None else [vector])]
+        if not keys:
+            raise DatasetError(f"{source}: data has nothing to observe, only {', '.join(sorted(data))}.")
     found = {}
     # The environment shows its entries in the order of their names.
     for name, wanted in sorted(keys.items()) if isinstance(keys, Mapping) else ((key, key) for key in keys):
@@ -208,9 +266,11 @@ def _read(array: Any, steps: slice, columns: slice, where: str) -> np.ndarray:
     values = np.asarray(array[steps])
     if values.ndim != 4 or values.dtype == np.uint8:
         return values if columns == slice(None) else values.reshape(len(values), -1)[:, columns]
-    images = values.astype(np.uint8)
+    with np.errstate(invalid="ignore"):
+        images = values.astype(np.uint8)
     if not (images == values).all():
         raise DatasetError(
-            f"{where}: images of {values.dtype} hold others than whole numbers from 0 to 255; scale them and store uint8."
+            f"{where}: images of {values.dtype} hold others than whole numbers from 0 to 255; scale them and store uint8, "
+            "or name what else is observed, observation_keys=[...]."
         )
     return images

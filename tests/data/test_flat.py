@@ -238,6 +238,33 @@ def test_an_hdf5_file_in_d4rls_layout(tmp_path):
         load_dataset(path)
 
 
+def test_a_group_of_an_hdf5_file_is_a_dictionary(tmp_path):
+    found = arrays()
+    parts = {"b": found["observations"][:, :1], "a": found["observations"][:, 1:]}
+    images = np.random.default_rng(0).integers(0, 256, (N, 8, 8, 3), dtype=np.uint8)
+    rest = {name: array for name, array in found.items() if name != "observations"}
+    path = tmp_path / "groups.hdf5"
+    with h5py.File(path, "w") as file:
+        for name, array in {**rest, "observations/camera": images, **{f"observations/{p}": parts[p] for p in parts}}.items():
+            file[name] = array
+    buffer = load_dataset(path, action_bounds=(-3, 3))
+    np.testing.assert_array_equal(buffer.observations, np.roll(found["observations"], -1, axis=1).astype(np.float32))
+    np.testing.assert_array_equal(buffer.own("camera").numpy(), images)
+    chosen = load_dataset(path, action_bounds=(-3, 3), observation_keys=["b"])
+    np.testing.assert_array_equal(chosen.observations, parts["b"].astype(np.float32))
+    with h5py.File(path, "a") as file:
+        file["observations/deeper/c"] = parts["b"]
+    with pytest.raises(DatasetError, match=r"observations: deeper is a group of 'c'; an array of numbers is expected"):
+        load_dataset(path, action_bounds=(-3, 3))
+    with h5py.File(path, "a") as file:
+        del file["observations/deeper"]
+        zeros = file.create_dataset("observations/zeros", data=np.zeros((N, 10**6), np.int8), compression="gzip")
+        for number in range(9):
+            file[f"observations/again_{number}"] = zeros
+    with pytest.raises(DatasetError, match=r"observations claim 90\d+ bytes, of which \d+ are stored"):
+        load_dataset(path, action_bounds=(-3, 3))
+
+
 def test_a_dictionary_of_arrays():
     found = arrays()
     parts = {"b": found["observations"][:, :1], "a": {"c": found["observations"][:, 1:]}}

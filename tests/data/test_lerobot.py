@@ -1,7 +1,9 @@
 """LeRobot's folders: written as its formats 2.1 and 3.0 describe them."""
 
 import json
+import re
 import time
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -80,6 +82,40 @@ def test_rewards_and_successes(tmp_path):
     assert buffer.terminated.tolist() == [False, True, False]
     ended = {"next.reward": np.arange(12.0), "next.done": np.array([0] * 11 + [1], bool)}
     assert load_dataset(write(tmp_path / "ended", **ended)).terminated.tolist() == [False, False, True]
+    assert load_dataset(write(tmp_path / "short", reward=np.arange(12.0))).episode_returns.tolist() == [3, 25, 38]
+
+
+LISTS = {
+    "lists of lists": pa.list_(pa.list_(pa.float32())),
+    "large lists": pa.large_list(pa.large_list(pa.float32())),
+    "lists of one size": pa.list_(pa.list_(pa.float32(), 2), 4),
+    "tensors": pa.fixed_shape_tensor(pa.float32(), (4, 2)),
+}
+
+
+@pytest.mark.parametrize("kind", LISTS)
+def test_all_axes_of_a_feature_are_observed(kind, tmp_path):
+    keypoints = np.arange(96, dtype=np.float32).reshape(12, 4, 2)
+    path = write(tmp_path / "arm", "v3.0", **{"observation.state": None, "observation.environment_state": keypoints[:, 0]})
+    (file,) = (tmp_path / "arm" / "data" / "chunk-000").iterdir()
+    is_tensor = isinstance(LISTS[kind], pa.FixedShapeTensorType)
+    array = (
+        pa.FixedShapeTensorArray.from_numpy_ndarray(keypoints) if is_tensor else pa.array(keypoints.tolist(), LISTS[kind])
+    )
+    table = pq.read_table(file).drop_columns("observation.environment_state")
+    pq.write_table(table.append_column("observation.environment_state", array), file)
+    np.testing.assert_array_equal(load_dataset(path).observations, keypoints.reshape(12, 8))
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "int8", "int16", "uint16", "uint32", "uint64"])
+def test_whole_numbers_of_any_size_are_observed(dtype, tmp_path):
+    touch = {"observation.touch": np.arange(12, dtype=dtype), "observation.state": None}
+    info = json.loads((Path(write(tmp_path / "arm", **touch)) / "meta" / "info.json").read_text())
+    info["features"]["observation.note"] = {"dtype": "string", "shape": [1], "names": None}
+    (tmp_path / "arm" / "meta" / "info.json").write_text(json.dumps(info))
+    with pytest.warns(UserWarning, match=r"arm: neither numbers nor images, and not read: observation\.note \(string\)\."):
+        buffer = load_dataset(tmp_path / "arm")
+    assert buffer.observations[:, 2].tolist() == list(range(12))
 
 
 UNFIT = {
@@ -134,7 +170,7 @@ def test_damaged_files(tmp_path):
         load_dataset(path)
     table = whole.drop_columns("action")
     pq.write_table(table.append_column("action", [[[1.0]] * 11 + [[1.0, 2.0]]]), file)
-    with pytest.raises(DatasetError, match=r"action holds lists of 1 to 2 numbers; one length is expected"):
+    with pytest.raises(DatasetError, match=r"action holds lists of 1 to 2 entries; one length is expected"):
         load_dataset(path)
     zeros = pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(12 * 400_000, np.float32)), 400_000)
     bomb = table.append_column("action", zeros)
@@ -161,6 +197,12 @@ def test_a_link_out_of_the_folder_is_refused(tmp_path):
         load_dataset(path)
 
 
+@pytest.mark.parametrize("episodes", [1, "12", [0.5], ["a"], [[1]], [-1]])
+def test_episodes_that_are_no_list_of_numbers(episodes, tmp_path):
+    with pytest.raises(ValueError, match=rf"episodes must be a list of whole .*, or None, got {re.escape(repr(episodes))}"):
+        load_dataset(write(tmp_path / "arm", **{"next.reward": np.zeros(12)}), episodes=episodes)
+
+
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_some_of_the_episodes(version, tmp_path):
     path = write(tmp_path / "arm", version)
@@ -180,5 +222,7 @@ def test_the_time_to_find_episodes_grows_with_their_number_alone():
 
 
 def test_without_rewards_it_is_said_what_counts(tmp_path):
-    with pytest.warns(UserWarning, match=r"arm: there is none of rewards, .* every episode counts as one"):
+    with pytest.warns(
+        UserWarning, match=r"arm: there is no feature next.reward or reward of numbers, .* every episode counts as one"
+    ):
         load_dataset(write(tmp_path / "arm"))

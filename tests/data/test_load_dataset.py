@@ -157,7 +157,7 @@ def test_a_missing_file_is_named(name: str):
 
 def test_a_missing_file_is_named_before_an_option_that_it_would_not_have():
     with pytest.raises(DatasetError, match=r"missing.hdf5 does not exist; the path of a robomimic file"):
-        load_dataset("missing.hdf5", action_bounds=(-1, 1))
+        load_dataset("missing.hdf5", image_size=(8, 8))
 
 
 @pytest.mark.parametrize("kind", [str, Path])
@@ -181,7 +181,7 @@ def test_anything_else_is_refused_with_what_is_accepted(dataset: Any):
 def test_an_unknown_option_is_refused_with_those_there_are(robomimic_file: Path, minari_dataset: minari.MinariDataset):
     with pytest.raises(
         TypeError,
-        match=r"unknown option filter \(did you mean filter_key\?\); accepted: filter_key, observation_keys, clip_act",
+        match=r"unknown option filter \(did you mean filter_key\?\); accepted: filter_key, observation_keys, action_b",
     ):
         load_dataset(robomimic_file, filter="train")
     with pytest.raises(TypeError, match="test/ones-v0: unknown option filter_key; accepted: observation_keys, clip_act"):

@@ -7,6 +7,7 @@ import re
 import h5py
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from sb3_dtfm.data import load_dataset
 from sb3_dtfm.data.robomimic import load_robomimic
@@ -118,7 +119,9 @@ def test_without_rewards_the_first_done_step_is_the_success(path, stored):
             demo["rewards"][:] = 0.0
         else:
             del demo["rewards"]
-    buffer = load_robomimic(write(path, demos))
+    told = "there is no reward but 0" if stored == "zeros" else "there are no rewards"
+    with pytest.warns(UserWarning, match=f"demos.hdf5: {told}, nor any success, so that every episode counts as one"):
+        buffer = load_robomimic(write(path, demos))
     assert buffer.episode_lengths.tolist() == [6, 4]
     assert buffer.episode_returns.tolist() == [1.0, 1.0]
     assert buffer.terminated.all()
@@ -136,7 +139,15 @@ def test_dense_rewards_are_kept(path):
     demo["rewards"] = np.array([0.125, 0.5, 1.0, 1.0])
     buffer = load_robomimic(write(path, {"demo_0": demo}, env_args(reward_shaping=True)))
     assert buffer.rewards.tolist() == [0.125, 0.5, 1.0, 1.0]
-    assert buffer.terminated.tolist() == [True]
+    assert (buffer.terminated.tolist(), buffer.truncated.tolist()) == ([False], [True])
+
+
+@pytest.mark.parametrize("rewards", [[5.0, 5.0], [0.0, 0.9], [-1.0, 0.0]])
+def test_dense_rewards_tell_of_no_success(rewards, path):
+    write(path, {"demo_0": {**make_demo(2), "rewards": np.array(rewards)}})
+    assert np.isnan(load_dataset(path).successes).all()
+    with pytest.raises(DatasetError, match=r"of 1 of 1 episodes the data do not tell whether they succeeded"):
+        load_dataset(path, success_only=True)
 
 
 @pytest.mark.parametrize("dtype", ["S", "O"])
@@ -354,6 +365,27 @@ def test_actions_outside_of_the_controllers_range_can_be_clipped(path):
     assert load_robomimic(path, clip_actions=True).actions.max() == 1.0
 
 
+OWN = {"env_name": "MyEnv-v0", "type": 2, "env_kwargs": {}}
+
+
+def test_the_range_of_others_environments_is_given(path, tmp_path):
+    demo = make_demo(3)
+    demo["actions"] = np.linspace(-90, 90, 21).reshape(3, 7)
+    write(path, {"demo_0": demo}, OWN)
+    assert re.search(r"action -90 .*outside of .*\[-1, 1\]. This range is the default. Give .*action_bounds", refused(path))
+    given = {"action_bounds": (-90, 90)}, {"action_space": spaces.Box(-90, 90, (7,))}
+    for options in [*given, *({**each, "cache_dir": tmp_path / "cache"} for each in given)]:
+        buffer = load_dataset(path, **options)
+        assert (buffer.action_space.low.tolist(), buffer.action_space.high.tolist()) == ([-90.0] * 7, [90.0] * 7)
+        np.testing.assert_array_equal(buffer.actions, demo["actions"].astype(np.float32))
+
+
+def test_the_range_of_robosuites_controllers_is_the_files(path):
+    write(path, {"demo_0": make_demo(3)})
+    assert "action_bounds is (-90, 90); robosuite's controller, which" in refused(path, action_bounds=(-90, 90))
+    assert load_dataset(path, action_space=spaces.Box(-90, 90, (7,))).action_space.high.tolist() == [1.0] * 7
+
+
 def test_a_file_that_names_no_environment_is_read(path):
     write(path, {"demo_0": make_demo(3)})
     with h5py.File(path, "a") as file:
@@ -381,6 +413,11 @@ def test_cameras_are_chosen_beside_numbers(tmp_path):
     buffer = load_robomimic(tmp_path / "image.hdf5", observation_keys=["agentview_image", "robot0_eef_pos"])
     np.testing.assert_array_equal(buffer.own("agentview_image").numpy(), np.concatenate(images))
     assert buffer.observations.shape == (7, 3)
+    named = load_robomimic(
+        tmp_path / "image.hdf5", observation_keys={"pixels": "agentview_image", "agent_pos": "robot0_eef_pos"}
+    )
+    assert set(named.image_spaces) == {"pixels"}
+    np.testing.assert_array_equal(named.observations, buffer.observations)
     with h5py.File(tmp_path / "image.hdf5", "a") as file:
         del file["data/demo_1/obs/agentview_image"]
         file["data/demo_1/obs/agentview_image"] = images[1].astype(np.float32) / 255

@@ -79,6 +79,16 @@ def test_columns_of_vectors(tmp_path):
         assert (buffer.observation_space.shape, buffer.terminated.tolist()) == ((2,), [True, True])
 
 
+@pytest.mark.parametrize("kind", ["list_", "large_list", "list_view", "large_list_view"])
+def test_parquet_columns_of_any_kind_of_list(kind, tmp_path):
+    if not hasattr(pa, kind):
+        pytest.skip("this pyarrow has none")
+    vectors = pa.array([[0.0, 1.0], [2.0, 3.0]], getattr(pa, kind)(pa.float64()))
+    numbers = {"action": [0.5, -0.5], "reward": [1.0, 2.0], "done": [False, True]}
+    buffer = load_dataset(as_parquet(tmp_path, {"obs": vectors, **numbers}))
+    assert buffer.observations.tolist() == [[0, 1], [2, 3]]
+
+
 def test_numbered_columns_come_by_their_numbers(write):
     """As text, 10 comes before 2."""
     rest = {name: COLUMNS[name] for name in ("episode", "action", "reward")}

@@ -43,7 +43,8 @@ def load(path, **kwargs):
 def test_a_folder_and_a_zip_hold_the_same_episodes(arrays, tmp_path):
     folder = write(tmp_path / "push.zarr", arrays)
     shutil.make_archive(str(folder), "zip", folder)
-    for path in (folder, tmp_path / "push.zarr.zip"):
+    shutil.make_archive(str(tmp_path / "from_outside.zarr"), "zip", tmp_path, "push.zarr")
+    for path in (folder, tmp_path / "push.zarr.zip", tmp_path / "from_outside.zarr.zip"):
         buffer = load(path)
         assert buffer.episode_lengths.tolist() == [3, 5]
         np.testing.assert_array_equal(buffer.observations.numpy(), arrays["data/state"])
@@ -62,7 +63,58 @@ def test_the_environments_names_and_some_columns(arrays, tmp_path):
     assert (alone.observations == 0).all()
 
 
+@pytest.mark.parametrize(("name", "shape"), [("reward", (N,)), ("rewards", (N, 1))])
+def test_rewards_and_ends_are_read_where_they_are(name, shape, arrays, tmp_path, recwarn):
+    arrays[f"data/{name}"] = np.arange(N, dtype=np.float32).reshape(shape)
+    arrays["data/terminals"] = np.eye(1, N, 2)[0]
+    arrays["data/timeouts"] = np.eye(1, N, N - 1)[0] > 0
+    buffer = load_dataset(write(tmp_path / "push.zarr", arrays), action_bounds=(0, 512))
+    assert buffer.rewards.tolist() == list(range(N))
+    assert (buffer.terminated.tolist(), buffer.truncated.tolist()) == ([True, False], [False, True])
+    assert not [each for each in recwarn if "reward" in str(each.message)]
+
+
+@pytest.mark.parametrize("images", [True, False])
+def test_without_a_state_all_numbers_are_observed(images, arrays, tmp_path):
+    parts = {"data/gripper": np.arange(N, dtype=np.uint8)[:, None], "data/robot_eef_pose": arrays.pop("data/state")}
+    arrays |= {**parts, "data/timeouts": np.zeros(N, bool), "data/times": np.zeros(3)}
+    if not images:
+        del arrays["data/img"]
+    with pytest.warns(UserWarning, match=r"Not read: times\."):
+        buffer = load_dataset(write(tmp_path / "push.zarr", arrays), action_bounds=(0, 512))
+    np.testing.assert_array_equal(buffer.observations.numpy(), np.hstack(list(parts.values())))
+    assert set(buffer.image_spaces) == ({"img"} if images else set())
+
+
+def test_whole_floats_are_ends_and_a_float_is_an_action_of_one_number(arrays, tmp_path):
+    arrays |= {"data/action": arrays["data/action"][:, 0], "meta/episode_ends": np.array(ENDS, float)}
+    buffer = load(write(tmp_path / "push.zarr", arrays))
+    assert buffer.episode_lengths.tolist() == [3, 5]
+    assert buffer.action_space == spaces.Box(0, 512, (1,))
+    np.testing.assert_array_equal(buffer.actions[:, 0].numpy(), arrays["data/action"])
+    arrays["data/action"] = np.arange(N) % 3
+    path = write(tmp_path / "choices.zarr", arrays)
+    assert load_dataset(path, action_space=spaces.Box(0, 2, (1,))).actions[:, 0].tolist() == [0, 1, 2, 0, 1, 2, 0, 1]
+    assert load_dataset(path, action_space=spaces.Discrete(3)).actions[1].tolist() == [0, 1, 0]
+
+
 REFUSED = {
+    "half an end": (
+        lambda arrays: arrays.update({"meta/episode_ends": np.array([2.5, 8.0])}),
+        r"is \[2\.5 8\. *\], expected ascending whole numbers of steps, the last one 8",
+    ),
+    "no pixel": (
+        lambda arrays: arrays["data/img"].__setitem__(0, np.nan),
+        r"img: images of float32 hold .*; scale them and store uint8, or name what else is observed, observation_keys=",
+    ),
+    "rewards": (
+        lambda arrays: arrays.update({"data/reward": np.zeros((N, 2))}),
+        r"reward has shape \(8, 2\), expected \(8,\)",
+    ),
+    "nothing to observe": (
+        lambda arrays: [arrays.pop(name) for name in ("data/img", "data/state")],
+        r"data has nothing to observe, only action\.",
+    ),
     "no ends": (lambda arrays: arrays.pop("meta/episode_ends"), r"has no meta/episode_ends"),
     "ends": (lambda arrays: arrays.update({"meta/episode_ends": np.array([3, 9])}), r"ascending .*, the last one 8"),
     "no actions": (
@@ -78,7 +130,7 @@ REFUSED = {
 }
 
 
-@pytest.mark.filterwarnings("ignore:.*every episode counts")
+@pytest.mark.filterwarnings("error", "ignore:.*every episode counts")
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_does_not_fit_is_refused_by_name(name, arrays, tmp_path):
     spoil, message = REFUSED[name]
