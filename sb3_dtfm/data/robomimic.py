@@ -296,11 +296,14 @@ def _labels(demo: h5py.Group, where: str) -> _Labels:
 
 
 def _rewards(labels: dict[str, _Labels]) -> tuple[dict[str, np.ndarray], bool]:
-    """Rewards as the environment gives them, cut after the first success, and whether they tell of success."""
+    """
+    Rewards as the environment gives them, cut after the first success, and whether they tell of success: not if others
+    than 0 and 1 are there, nor if a reward is there from the first step on.
+    """
     stored = {
         name: np.zeros(demo.n_steps) if demo.rewards is None else demo.rewards.astype(float) for name, demo in labels.items()
     }
-    if not all(np.isin(array, (0.0, 1.0)).all() for array in stored.values()):
+    if not all(np.isin(array, (0.0, 1.0)).all() and not array[:-1][:1].any() for array in stored.values()):
         return stored, False
     rewarded = any(array.any() for array in stored.values())
     rewards = {}

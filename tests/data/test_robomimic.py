@@ -142,10 +142,12 @@ def test_dense_rewards_are_kept(path):
     assert (buffer.terminated.tolist(), buffer.truncated.tolist()) == ([False], [True])
 
 
-@pytest.mark.parametrize("rewards", [[5.0, 5.0], [0.0, 0.9], [-1.0, 0.0]])
+@pytest.mark.parametrize("rewards", [[5.0, 5.0], [0.0, 0.9], [-1.0, 0.0], [1.0, 1.0]])
 def test_dense_rewards_tell_of_no_success(rewards, path):
     write(path, {"demo_0": {**make_demo(2), "rewards": np.array(rewards)}})
-    assert np.isnan(load_dataset(path).successes).all()
+    buffer = load_dataset(path)
+    assert buffer.rewards.tolist() == pytest.approx(rewards)
+    assert np.isnan(buffer.successes).all()
     with pytest.raises(DatasetError, match=r"of 1 of 1 episodes the data do not tell whether they succeeded"):
         load_dataset(path, success_only=True)
 
