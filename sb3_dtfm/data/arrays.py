@@ -250,6 +250,10 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
         rows = csv.reader(file, strict=True)
         names = [name.strip() for name in next(rows, [])]
         lines = [row for row in rows if row]
+    if len(names) == 1 and {";", "\t"} & set(names[0]):
+        raise DatasetError(
+            f"{path}: the first row is {names[0]!r}; commas are expected between names, and points in numbers."
+        )
     for number, row in enumerate(lines, 2):
         if len(row) != len(names):
             raise DatasetError(f"{path}, row {number}: has {len(row)} entries, and the first row names {len(names)}.")

@@ -110,6 +110,7 @@ def test_steps_of_an_episode_lie_side_by_side(write):
 
 UNFIT = {
     "a short row": ("obs_0,action,done\n1,0.5,0\n1,0.5\n", r"log.csv, row 3: has 2 entries, and the first row names 3"),
+    "semicolons": ("obs_0;action;done\n1,5;0,5;1\n", "the first row is 'obs_0;action;done'; commas are expected between"),
     "a name twice": ("obs_0,obs_0,action\n1,2,3\n", "a name for each column is expected, each once"),
     "words": ("obs_0,action,done\nfar,0.5,1\n", "obs_0 hold object; real numbers are expected"),
     "a hole": ("obs_0,action,done,reward\n1,0.5,0,1\n,0.5,1,1\n", "episode 0, step 1: observations hold nan"),
