@@ -26,14 +26,16 @@ def register_gymnasium_robotics() -> None:
     It is imported when a task may be one of its own, since that takes half a second and MuJoCo, and in silence: its notice
     is about the tasks that :func:`warn_of_reward` warns of.
     """
-    with contextlib.redirect_stderr(io.StringIO()), contextlib.suppress(ImportError):
-        try:
+    try:
+        with contextlib.redirect_stderr(io.StringIO()):
             import gymnasium_robotics
-        except AttributeError as error:  # MuJoCo's, of a library for rendering that is missing
-            how = f"MUJOCO_GL={os.environ.get('MUJOCO_GL')}"
-            warnings.warn(f"MuJoCo cannot be imported with {how} ({error}): is its library installed?", stacklevel=2)
-            return
-        gym.register_envs(gymnasium_robotics)
+    except ImportError:
+        return
+    except AttributeError as error:  # MuJoCo's, of a library for rendering that is missing
+        how = f"MUJOCO_GL={os.environ.get('MUJOCO_GL')}"
+        warnings.warn(f"MuJoCo cannot be imported with {how} ({error}): is its library installed?", stacklevel=2)
+        return
+    gym.register_envs(gymnasium_robotics)
 
 
 def _object(env: gym.Env) -> tuple[str, str] | None:

@@ -5,6 +5,7 @@ import csv
 import math
 import os
 import re
+import warnings
 import zipfile
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -69,15 +70,24 @@ class Arrays(ABC):
 
     def columns(self, names: Sequence[str]) -> list[str]:
         """
-        The columns of a table that begin with the first of the names that any begins with: those with nothing but numbers
-        behind it, as `obs_0`, `obs[0]` or `obs_0_1`, by these numbers; or else all, as `obs.x`, but the next step's.
+        The columns of a table that begin with the first of the names that any begins with, as `obs.x` and `obs.y`, but the
+        next step's. If there are some with nothing but numbers behind it, as `obs_0` or `obs[0]`, those alone.
         """
         if self.are_columns and not self.has(names):
             for name in names:
-                found = [each for each in self.names if re.match(rf"{name}[\W_\d]", each) and "next" not in each]
+                following = rf"{name}[\W_]+next([\W_]|$)"
+                found = [each for each in self.names if re.match(rf"{name}[\W_\d]", each) and not re.match(following, each)]
                 numbered = [each for each in found if re.fullmatch(rf"{name}[\W_\d]*\d[\W_]*", each)]
+                if unread := sorted(set(found) - set(numbered or found)):
+                    warnings.warn(
+                        f"{self.source}: {', '.join(numbered)} are read, and not {', '.join(unread)}. "
+                        "observation_keys=[...] and action_keys=[...] name columns to read.",
+                        stacklevel=4,
+                    )
+                found = numbered or found
                 if found:
-                    return sorted(numbered, key=lambda each: list(map(int, re.findall(r"\d+", each)))) or found
+                    alike = len({re.sub(r"\d+", "0", each) for each in found}) == 1
+                    return sorted(found, key=lambda each: list(map(int, re.findall(r"\d+", each)))) if alike else found
         return [self.name(names)]
 
     def stored(self, name: str) -> Any:
@@ -234,7 +244,7 @@ class _Parquet(Arrays):
         table.validate(full=True)
         column = table[name].combine_chunks()
         pyarrow = import_pyarrow(where)
-        if pyarrow.types.is_nested(column.type) or isinstance(column, pyarrow.ExtensionArray):
+        if pyarrow.types.is_nested(getattr(column.type, "storage_type", column.type)):
             return as_numbers(column, where)
         return column.to_numpy(zero_copy_only=False)
 

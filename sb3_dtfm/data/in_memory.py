@@ -36,10 +36,9 @@ from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_space, wrap_dataset_errors
 from sb3_dtfm.envs.success import reported_success
 
-# What one step of an episode that was written down step by step holds, in this order.
+# What one step of an episode that was written down step by step holds, in this order. The next observation may be there,
+# too, before the reward or behind it.
 STEP = ("observation", "action", "reward", "terminated", "truncated")
-SB3_STEP = ("observation", "action", "next_observation", "reward", "done")
-TEXTBOOK_STEP = ("observation", "action", "reward", "next_observation", "done")
 SHORT_STEP = ("observation", "action", "reward", "done")
 INFO = ("info", "infos")
 PARTS = (REWARDS, ACTIONS, OBSERVATIONS)
@@ -64,17 +63,26 @@ def _is_step(found: Any) -> bool:
         reward, action, observation = (next((found[name] for name in names if name in found), None) for names in PARTS)
         if reward is not None:
             return _n_axes(reward) == 0
-        return action is not None and (_n_axes(action) == 0 or (_n_axes(action) == 1 and _is_single(observation)))
+        if action is None or _n_axes(action) != 1:
+            return action is not None and _n_axes(action) == 0
+        return _n_axes(found.get("done", ())) == 0 or _is_single(observation, len(action))
     if not is_episodes(found) or not len(found):
         return False
     parts = _parts(found)
     return len(parts) >= len(SHORT_STEP) and not isinstance(parts[-1], Mapping | Sequence) and np.size(parts[-1]) == 1
 
 
-def _is_single(observation: Any) -> bool:
-    """Return whether this is an observation of one step: a vector, an image, or a dictionary of such and of numbers."""
+def _is_single(observation: Any, n_actions: int) -> bool:
+    """
+    Return whether this is an observation of one step, and not one number for each of so many steps.
+
+    :param observation: a vector, an image, or a dictionary of such and of numbers
+    :param n_actions: numbers of the action, or steps
+    """
     if isinstance(observation, Mapping):
-        return all(_n_axes(part) == 0 or _is_single(part) for part in observation.values())
+        parts = observation.values()
+        told = any(_n_axes(part) != 1 or len(part) != n_actions for part in parts)
+        return told and all(_n_axes(part) == 0 or _is_single(part, n_actions) for part in parts)
     return _n_axes(observation) == (3 if getattr(observation, "dtype", None) == np.uint8 else 1)
 
 
@@ -94,8 +102,9 @@ def _shape(found: Any) -> tuple[int, ...] | None:
 
 def _parts(step: Sequence[Any]) -> list[Any]:
     """Return what a step begins with, without its info, and without what comes after the flags."""
-    n_first = len(SHORT_STEP)
-    return [*step[:n_first], *(part for part in step[n_first:] if not isinstance(part, Mapping))][: len(STEP)]
+    n_first, n_most = len(SHORT_STEP), len(STEP) + 1
+    parts = [*step[:n_first], *(part for part in step[n_first:] if not isinstance(part, Mapping))][:n_most]
+    return parts[:-1] if len(parts) == n_most and isinstance(parts[-1], Sequence) else parts
 
 
 def load_steps(
@@ -145,33 +154,37 @@ def _arrays_of_steps(steps: Sequence[Any], where: str) -> dict[str, Any]:
     return arrays
 
 
-def _is_like(part: Any, observation: Any) -> bool:
-    """Return whether this is an observation, too, and no flag. Of observations that are numbers nothing tells."""
-    if isinstance(observation, Mapping | tuple):
-        return type(part) is type(observation)
-    return _n_axes(observation) > 0 and _shape(part) == _shape(observation) and np.asarray(part).dtype != bool
-
-
 def _by_name(step: Any) -> Any:
-    """A named tuple as the dictionary of its parts, if observations have one of their names; anything else as it is."""
-    fields = getattr(step, "_fields", ())
-    return step._asdict() if set(OBSERVATIONS) & set(fields) else step
+    """A named tuple as the dictionary of its parts, if all that is needed has known names; anything else as it is."""
+    fields = set(getattr(step, "_fields", ()))
+    known = {*OBSERVATIONS, *ACTIONS, *REWARDS, *TERMINATIONS, *TRUNCATIONS, *DONES, *INFO}
+    unknown = [name for name in fields - known if not name.startswith("next")]
+    return step._asdict() if not unknown and all(fields & set(names) for names in PARTS) else step
 
 
 def _named(step: Sequence[Any]) -> dict[str, Any]:
-    """A step's parts by their names."""
+    """A step's parts by their names, without the next observation."""
     infos = [part for part in step[len(SHORT_STEP) :] if isinstance(part, Mapping)]
     parts = _parts(step)
-    names: tuple[str, ...] = SHORT_STEP
-    if len(parts) == len(STEP):
-        # Of observations that are numbers, only the types tell a reward and a flag from two flags.
-        told_apart = _n_axes(step[0]) > 0 or type(step[3]) is not type(step[4])
-        followed = _shape(step[2]) == _shape(step[0]) and not isinstance(step[3], bool | np.bool_) and told_apart
-        names = SB3_STEP if followed or isinstance(step[2], Mapping | tuple) else STEP
-        if not _n_axes(step[2]) and _is_like(step[3], step[0]):
-            names = TEXTBOOK_STEP
-    found = {name: part for name, part in zip(names, parts, strict=True) if name != "next_observation"}
-    return {**found, **({INFO[0]: infos[0]} if infos else {})}
+    if len(parts) > len(SHORT_STEP) and (place := _next_observation(parts)):
+        del parts[place]
+    names = STEP if len(parts) >= len(STEP) else SHORT_STEP
+    return {**dict(zip(names, parts, strict=False)), **({INFO[0]: infos[0]} if infos else {})}
+
+
+def _next_observation(parts: Sequence[Any]) -> int | None:
+    """Return where the next observation is: behind the action as SB3 has it, behind the reward, or nowhere."""
+    observation, _, third, fourth, fifth = parts[:5]
+    if isinstance(observation, Mapping | tuple):
+        return next((place for place in (2, 3) if isinstance(parts[place], Mapping | tuple)), None)
+    # Of observations that are numbers, only the types tell a reward and a flag from two flags.
+    told_apart = _n_axes(observation) > 0 or type(fourth) is not type(fifth)
+    if _shape(third) == _shape(observation) and not isinstance(fourth, bool | np.bool_) and told_apart:
+        return 2
+    if not _n_axes(observation) > _n_axes(third) == 0 or _shape(fourth) != _shape(observation):
+        return None
+    two_flags = _shape(fifth) == _shape(fourth) and np.asarray(fifth).dtype == np.asarray(fourth).dtype
+    return None if two_flags else 3
 
 
 def load_episodes(
@@ -194,9 +207,8 @@ def load_episodes(
     - a trajectory of the package imitation: `obs`, `acts`, `terminal`, `rews` where it has some
     - a list of steps `(observation, action, reward, terminated, truncated)`, as they come from a Gymnasium environment:
       the observation that the action was chosen on, and what `env.step(action)` then returned, with the info, whose success
-      is known of the episode, or without; or of `(observation, action, reward, done)`, of SB3's `(observation, action,
-      next_observation, reward, done)`, of `(observation, action, reward, next_observation, done)`, or of dictionaries or
-      named tuples of these
+      is known of the episode, or without; or of `(observation, action, reward, done)`; with the next observation, too,
+      before the reward as SB3 has it, or behind it; or of dictionaries or named tuples of these
 
     Without rewards a success has a reward of 1 at its last step, and every episode is one where nothing tells.
 
@@ -277,10 +289,10 @@ def _arrays_of_episode(episode: Any, where: str) -> Mapping[str, Any]:
         return {**arrays, **({"rews": episode.rews} if hasattr(episode, "rews") else {})}
     if is_episodes(episode) and len(episode) and all(_is_step(step) for step in episode):
         return _arrays_of_steps(episode, where)
-    steps = "; ".join(", ".join(names) for names in (STEP, SB3_STEP, TEXTBOOK_STEP, SHORT_STEP))
+    steps = "; ".join(", ".join(names) for names in (STEP, SHORT_STEP))
     raise DatasetError(
         f"{where} is a {type(episode).__name__}; accepted are a dictionary of arrays, a Trajectory, a trajectory of "
-        f"imitation, or a list of steps ({steps})."
+        f"imitation, or a list of steps ({steps}; the next observation may stand beside the reward)."
     )
 
 

@@ -4,7 +4,7 @@ import json
 import os
 import re
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ NUMBERS = (
     *(f"float{n}" for n in (16, 32, 64)),
     *(f"{kind}{n}" for kind in ("int", "uint") for n in (8, 16, 32, 64)),
 )
+WHOLE = re.compile("u?int")
 
 
 def is_lerobot(dataset: Any) -> bool:
@@ -85,7 +86,8 @@ def load_lerobot(
     source = str(folder)
     info = _info(folder, source)
     features = {name: each["dtype"] for name, each in info["features"].items()}
-    names = _names(observation_keys, features, source)
+    maps = {name for name, each in info["features"].items() if WHOLE.match(each["dtype"]) and len(each.get("shape", ())) > 1}
+    names = _names(observation_keys, features, maps, source)
     cameras = {name: key for name, key in names.items() if features[key] in (IMAGE, VIDEO)}
     vectors = [key for name, key in names.items() if name not in cameras]
     reward = next((name for name in REWARDS if features.get(name) in NUMBERS), REWARDS[0])
@@ -161,13 +163,18 @@ def _info(folder: Path, source: str) -> dict[str, Any]:
         return info
 
 
-def _names(keys: Sequence[str] | Mapping[str, str] | None, features: Mapping[str, str], source: str) -> dict[str, str]:
-    """The features that are observed, by the names that they have in the observation."""
+def _names(
+    keys: Sequence[str] | Mapping[str, str] | None, features: Mapping[str, str], maps: Collection[str], source: str
+) -> dict[str, str]:
+    """The features that are observed, by the names that they have in the observation; maps of depth if they are named."""
     known = sorted(name for name, dtype in features.items() if dtype in (*NUMBERS, IMAGE, VIDEO))
-    chosen = [name for name in known if name.startswith(OBSERVATION)] if keys is None else keys
-    unread = [f"{name} ({dtype})" for name, dtype in features.items() if name.startswith(OBSERVATION) and name not in known]
+    offered = [name for name in known if name.startswith(OBSERVATION) and name not in maps]
+    chosen = offered if keys is None else keys
+    unread = [
+        f"{name} ({dtype})" for name, dtype in features.items() if name.startswith(OBSERVATION) and name not in offered
+    ]
     if keys is None and unread:
-        warnings.warn(f"{source}: neither numbers nor images, and not read: {', '.join(unread)}.", stacklevel=3)
+        warnings.warn(f"{source}: neither vectors nor images, and not read: {', '.join(unread)}.", stacklevel=3)
     # The environment shows its entries in the order of their names.
     names = dict(sorted(chosen.items())) if isinstance(chosen, Mapping) else {name: name for name in chosen}
     for name in names.values():

@@ -158,22 +158,27 @@ def check_order(
     """
     Compare the entries that were chosen with those of an environment, which shows all of its own, sorted by name.
 
-    :param keys: `observation_keys`; names of which the environment has none cannot be compared
+    :param keys: `observation_keys`; only a mapping has to have the environment's names
     :param cameras: those of them that are images
     :param space: the environment's observation space, None if it is unknown
     :param source: for messages
-    :raises DatasetError: they have another order than the environment's, or it has only some of them
+    :raises DatasetError: they have another order than the environment's, or a mapping names what it does not observe
     """
     if keys is None or not isinstance(space, spaces.Dict):
         return
-    chosen = [key for key in (sorted(keys) if isinstance(keys, Mapping) else keys) if key not in cameras]
     shown = [key for key in sorted(space.spaces) if key not in image_spaces(space)]
-    known = [key for key in chosen if key in shown]
-    renamed = isinstance(keys, Mapping)
-    if known != sorted(known) or (len(known) < len(chosen) and (known or renamed)):
+    unknown = [key for key in keys if key not in cameras and key not in shown]
+    if isinstance(keys, Mapping) and unknown:
         raise DatasetError(
-            f"{source}: observation_keys {'name' if renamed else 'has'} {', '.join(chosen)}, in this order; the "
-            f"environment's entries of numbers are {', '.join(shown)}, in this one."
+            f"{source}: observation_keys names {', '.join(unknown)}; the environment's numbers are {', '.join(shown)}."
+        )
+    known = [key for key in keys if key in shown]
+    if not isinstance(keys, Mapping) and known != sorted(known):
+        there = iter(sorted(known))
+        cure = [next(there) if key in shown else key for key in keys]
+        raise DatasetError(
+            f"{source}: observation_keys has {', '.join(known)} in this order, and the environment shows its entries "
+            f"sorted by name: write observation_keys={cure}."
         )
 
 

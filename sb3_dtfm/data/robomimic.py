@@ -159,7 +159,8 @@ def _read(
             refused[name] = error
     if not refused:
         _check_count(data, "total", sum(demo.n_steps for demo in labels.values()), source)
-    rewards, tells_success = _rewards(labels)
+    of_robosuite = _is_robosuite(env_args)
+    rewards, tells_success = _rewards(labels, of_robosuite)
     if not any(demo.rewards is not None and demo.rewards.any() for demo in labels.values()):
         all_zero = any(demo.rewards is not None for demo in labels.values())
         warn_of_made_up_rewards((), source, "there is no reward but 0" if all_zero else "there are no rewards")
@@ -176,7 +177,7 @@ def _read(
         with wrap_dataset_errors(where):
             length, dones = len(rewards[name]), labels[name].dones
             seen = _observations(groups[name], where, labels[name].n_steps, observation_keys)
-            success = bool(rewards[name][-1] == 1.0) if tells_success else None
+            success = bool(rewards[name][-1] >= 1.0) if tells_success else None
             done = dones is not None and bool(dones[length - 1])
             return Trajectory(
                 observations=_present_object_state(seen.vectors, tuple(observation_keys.values()), env_args)[:length],
@@ -189,7 +190,7 @@ def _read(
                 name=name,
             )
 
-    with contextlib.nullcontext() if _is_robosuite(env_args) else explain_range(action_space, *bounds):
+    with contextlib.nullcontext() if of_robosuite else explain_range(action_space, *bounds):
         buffer = TrajectoryBuffer.from_trajectories(
             map(trajectory, demos),
             action_space=action_space,
@@ -295,15 +296,17 @@ def _labels(demo: h5py.Group, where: str) -> _Labels:
     return _Labels(rewards, dones, n_steps, n_actions)
 
 
-def _rewards(labels: dict[str, _Labels]) -> tuple[dict[str, np.ndarray], bool]:
+def _rewards(labels: dict[str, _Labels], of_robosuite: bool) -> tuple[dict[str, np.ndarray], bool]:
     """
-    Rewards as the environment gives them, cut after the first success, and whether they tell of success: not if others
-    than 0 and 1 are there, nor if a reward is there from the first step on.
+    Rewards as the environment gives them, cut after the first success, and whether they tell of success: robosuite's do,
+    also dense ones, which reach 1 then; of others those that are 0 and 1, unless 1 is there from the first step on.
     """
     stored = {
         name: np.zeros(demo.n_steps) if demo.rewards is None else demo.rewards.astype(float) for name, demo in labels.items()
     }
-    if not all(np.isin(array, (0.0, 1.0)).all() and not array[:-1][:1].any() for array in stored.values()):
+    if not all(np.isin(array, (0.0, 1.0)).all() for array in stored.values()):
+        return stored, of_robosuite
+    if not of_robosuite and any(array[:-1][:1].any() for array in stored.values()):
         return stored, False
     rewarded = any(array.any() for array in stored.values())
     rewards = {}

@@ -5,6 +5,7 @@ import json
 import math
 import os
 import re
+import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -31,6 +32,7 @@ from sb3_dtfm.data.flat import (
     explain_range,
     fitted,
     json_options,
+    told_flags,
     warn_of_made_up_rewards,
 )
 from sb3_dtfm.data.observations import observed
@@ -92,7 +94,7 @@ def _opened(path: Path) -> Iterator[Any]:
         for name in named:
             check_size(archive.getinfo(name).file_size, 0, f"{path}, {name}")
         _check_metadata({f"{path}, {name}": read for name, read in named.items()})
-    folders = {name.partition("/")[0] for name in names}
+    folders = {name.partition("/")[0] for name in names} - {"__MACOSX"}
     with zarr.storage.ZipStore(path, mode="r") as store:
         # All that is in a zip of a folder's parent is that folder.
         yield zarr.open_group(store, mode="r", path="".join(folders) if len(folders) == 1 else None)
@@ -179,11 +181,11 @@ def load_zarr(
             raise DatasetError(
                 f"{source}: {ENDS} is {stored_ends}, expected ascending whole numbers of steps, the last one {n_steps}."
             )
-        chosen = _chosen(data, observation_keys, n_steps, source)
+        chosen = _chosen(data, observation_keys, n_steps, observation_space, source)
         rewards = _first(data, REWARDS)
         if rewards is None:
             observed_arrays = {array for array, _ in chosen.values()}
-            warn_of_made_up_rewards(set(data) - observed_arrays - set(SUCCESSES), source)
+            warn_of_made_up_rewards(set(data) - observed_arrays, source)
         elif data[rewards].shape not in ((n_steps,), (n_steps, 1)):
             raise DatasetError(f"{source}: {rewards} has shape {data[rewards].shape}, expected ({n_steps},).")
         # One number a step is a choice only where it can be.
@@ -203,9 +205,13 @@ def load_zarr(
             seen = observed(entries, list(entries), observation_space, f"{source}, {where}")
             length = steps.stop - steps.start
             actions = fitted(actions_of(steps), space, clip_actions)
+            success = _success(data, steps, f"{source}, {where}")
             if rewards is None:
-                marks = np.eye(1, length, length - 1)[0]
-                return Trajectory(seen.vectors, actions, marks, terminated=True, name=where, images=seen.images)
+                done = success is not False
+                marks = done * np.eye(1, length, length - 1)[0]
+                return Trajectory(
+                    seen.vectors, actions, marks, terminated=done, success=success, name=where, images=seen.images
+                )
             terminal, timeout, done = (
                 _ended(data, names, steps, f"{source}, {where}") for names in (TERMINATIONS, TRUNCATIONS, DONES)
             )
@@ -215,6 +221,7 @@ def load_zarr(
                 np.asarray(data[rewards][steps]).reshape(-1),
                 terminated=terminal or (done and not timeout),
                 truncated=timeout,
+                success=success,
                 name=where,
                 images=seen.images,
             )
@@ -236,17 +243,36 @@ def _ended(data: Mapping[str, Any], names: Sequence[str], steps: slice, where: s
     return name is not None and bool(check_flags(data[name][steps], steps.stop - steps.start, f"{where}: {name}")[-1])
 
 
+def _success(data: Mapping[str, Any], steps: slice, where: str) -> bool | None:
+    """Whether an episode has succeeded, by its last step; None if nothing tells."""
+    name = _first(data, SUCCESSES)
+    if name is None:
+        return None
+    told, silent = told_flags(np.asarray(data[name][steps]), steps.stop - steps.start, f"{where}: {name}")
+    return None if silent[-1] else bool(told[-1])
+
+
 def _chosen(
-    data: Mapping[str, Any], keys: Sequence[str] | Mapping[str, str] | None, n_steps: int, source: str
+    data: Mapping[str, Any],
+    keys: Sequence[str] | Mapping[str, str] | None,
+    n_steps: int,
+    space: spaces.Space | None,
+    source: str,
 ) -> dict[str, tuple[str, slice]]:
-    """The array and its columns of each entry of the observation."""
+    """The array and its columns of each entry of the observation; beside images numbers that the environment shows, too."""
     if keys is None:
         images = [name for name, array in data.items() if len(array.shape) == 4]
         vector = _first(data, OBSERVATIONS)
         others = {name for name, array in data.items() if array.shape[:1] == (n_steps,)} - NOT_OBSERVED - set(images)
-        keys = [*images, *(sorted(others) if vector is None else [vector])]
+        shown = others & set(getattr(space, "spaces", ())) if images and space is not None else others
+        keys = [*images, *(sorted(shown) if vector is None else [vector])]
         if not keys:
             raise DatasetError(f"{source}: data has nothing to observe, only {', '.join(sorted(data))}.")
+        if images and vector is None and others:
+            unread = ", ".join(sorted(others - shown)) or "nothing else"
+            warnings.warn(
+                f"{source}: {', '.join(keys)} are observed, {unread} is not; observation_keys=[...] chooses.", stacklevel=3
+            )
     found = {}
     # The environment shows its entries in the order of their names.
     for name, wanted in sorted(keys.items()) if isinstance(keys, Mapping) else ((key, key) for key in keys):

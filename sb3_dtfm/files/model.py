@@ -31,6 +31,7 @@ TENSORS_SUFFIX = ".safetensors"
 # Members of a file that Stable-Baselines3 itself, or an earlier version of this package, has written.
 PICKLED_DATA = "data"  # JSON, of which a part is pickled
 PICKLED = ("data", ".pth", ".pkl", ".pt")
+OTHER_ALGORITHMS = ("stable_baselines3", "sb3_contrib")  # packages of theirs
 MAX_CONFIGURATION = 2**24  # bytes
 # Errors of a zip file that is damaged, encrypted, newer than zipfile, or points behind its own end.
 DAMAGE = (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError, OverflowError, OSError)
@@ -191,8 +192,8 @@ class _Reader:
             self.fail("a member is there twice.")
         pickled = [name for name in self.infos if name.endswith(PICKLED)]
         if pickled:
-            if not (module := self._pickled_policy()).startswith(__package__.partition(".")[0]):
-                self.fail(f"saved by another algorithm: its policy is of {module}.")
+            if (library := self._policys_package()) in OTHER_ALGORITHMS:
+                self.fail(f"saved by another algorithm, one of {library}.")
             self.fail(
                 f"{', '.join(pickled)}: pickled, so loading could run code. If you trust the file, "
                 "load(path, allow_pickle=True).save(path) makes one without."
@@ -213,11 +214,12 @@ class _Reader:
             self.fail(f"format {version!r}{newer}; {FORMAT} is accepted.")
         return configuration
 
-    def _pickled_policy(self) -> str:
-        """The module of the policy that Stable-Baselines3 has saved, which is not pickled; ours if nothing tells."""
-        with contextlib.suppress(KeyError, TypeError, ValueError, RecursionError):
-            return str(json.loads(self._content(PICKLED_DATA, MAX_CONFIGURATION))["policy_class"]["__module__"])
-        return __package__
+    def _policys_package(self) -> str | None:
+        """The package of the policy that Stable-Baselines3 has saved, which is not pickled; None if nothing tells."""
+        with contextlib.suppress(KeyError, TypeError, ValueError, RecursionError, AttributeError):
+            module = json.loads(self._content(PICKLED_DATA, MAX_CONFIGURATION))["policy_class"]["__module__"]
+            return str(module.partition(".")[0])
+        return None
 
     def _no_number(self, text: str) -> NoReturn:
         self.fail(f"{CONFIGURATION} holds {text}; numbers must be finite.")

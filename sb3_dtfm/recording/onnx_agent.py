@@ -28,7 +28,7 @@ class OnnxAgent:
         except Exception as error:  # of ONNX Runtime's several kinds
             raise ValueError(f"{path} is no ONNX file that can be run: {error}") from error
         if "sb3_dtfm" in self._session.get_modelmeta().custom_metadata_map:
-            raise ValueError(f"{path} was exported by sb3-dtfm: name the model that was exported, --algo dtfm --model RUN.")
+            raise ValueError(f"{path} was exported by sb3-dtfm: name the run of the model that was exported, --model RUN.")
         inputs, output = self._session.get_inputs(), self._session.get_outputs()[0]
         sizes = [each.shape[-1] for each in (*inputs, output)]
         if len(inputs) != 1 or any(len(each.shape) != 2 for each in (*inputs, output)) or not _are_numbers(sizes):

@@ -88,8 +88,6 @@ class Start(NamedTuple):
                 f"--resume {run}: {CHECKPOINT} is missing, where the run continues; it would begin anew and replace what "
                 f"it has learned. Put the file back{copied}."
             )
-        if not start.has_checkpoint:
-            print(f"{run} was interrupted before its first {CHECKPOINT}: it begins anew.", flush=True)
         return start
 
 

@@ -287,7 +287,7 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
     cases = {
         "--model nowhere": "nowhere does not exist; --model names a DTFM's zip file or its run's folder.",
         "--model logs/dt/HalfCheetah-v5_1": "was saved by 'DT', not by DTFM.",
-        "--model agent.zip": "agent.zip: saved by another algorithm: its policy is of stable_baselines3.sac",
+        "--model agent.zip": "agent.zip: saved by another algorithm, one of stable_baselines3.",
         f"--model {run} --algo dtfm --dataset more.npz": "--dataset: the DTFM's own dataset is taken; -params dataset:...",
         "--model untold.zip": "--target-return R: needed, as untold.zip was saved without one; `sb3-dtfm inspect DATASET` ",
         f"--model {run} --algo td3": "--algo td3: no packaged settings; those of dtfm, ppo, sac, tqc are.",

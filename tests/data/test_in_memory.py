@@ -229,16 +229,45 @@ def test_chosen_entries_have_the_order_of_the_environments():
     """A Dict environment shows its entries sorted by name, whatever observation_keys says."""
     space = spaces.Dict(arm=spaces.Box(-9, 9, (2,)), gripper=spaces.Box(-9, 9, (2,)))
     arrays = {
-        **{name: np.full((8, 2), float(i)) for i, name in enumerate(("arm", "gripper", "other"))},
+        **{name: np.full((8, 2), float(i)) for i, name in enumerate(("arm", "gripper", "claw"))},
         **dict(actions=np.zeros((8, 1)), rewards=np.ones(8), episode_ends=[4, 8]),
     }
     right = load_dataset(arrays, observation_space=space, observation_keys=["arm", "gripper"])
     assert right.observations[0].tolist() == [0, 0, 1, 1]
-    for keys in (["gripper", "arm"], ["arm", "other"]):
-        with pytest.raises(DatasetError, match=rf"observation_keys has {', '.join(keys)}, .* numbers are arm, gripper, in"):
-            load_dataset(arrays, observation_space=space, observation_keys=keys)
-    named_otherwise = load_dataset({**arrays, "a": arrays["arm"]}, observation_space=space, observation_keys=["other", "a"])
-    assert named_otherwise.observations[0].tolist() == [2, 2, 0, 0]
+    cure = r"has gripper, arm in this order, .* sorted by name: write observation_keys=\['arm', 'gripper'\]"
+    with pytest.raises(DatasetError, match=cure):
+        load_dataset(arrays, observation_space=space, observation_keys=["gripper", "arm"])
+    named_otherwise = load_dataset(arrays, observation_space=space, observation_keys=["arm", "claw"])
+    assert named_otherwise.observations[0].tolist() == [0, 0, 2, 2]
+
+
+def test_truncations_of_steps_with_a_next_observation_are_kept():
+    states = np.arange(18.0).reshape(9, 2)
+    for end, next_first in itertools.product([3, 7], [False, True]):
+        steps = []
+        for t in range(8):
+            middle = (states[t + 1], 0.5) if next_first else (0.5, states[t + 1])
+            steps.append((states[t], np.array([0.1]), *middle, t == end, t in (3, 7) and t != end))
+        buffer = load_dataset(steps)
+        assert buffer.episode_lengths.tolist() == [4, 4]
+        assert buffer.rewards.tolist() == [0.5] * 8
+        assert buffer.terminated.tolist() == [end == 3, end == 7]
+        assert buffer.truncated.tolist() == [end == 7, end == 3]
+
+
+def test_named_tuples_of_other_names_go_by_their_places():
+    step = namedtuple("Step", ["state", "action", "reward", "done_trunc"])
+    episode = [step(np.ones(2), np.array([0.5]), 1.0, t == 2) for t in range(3)]
+    assert load_dataset([episode, episode]).terminated.all()
+    other = namedtuple("Other", ["obs", "action", "r", "done"])
+    assert load_dataset([other(*each) for each in episode]).rewards.tolist() == [1.0] * 3
+
+
+def test_an_episode_of_single_numbers_is_no_step():
+    episode = {"obs": {"a": np.zeros(5), "b": np.ones(5)}, "actions": np.array([0, 1, 1, 0, 1]), "terminated": True}
+    with pytest.warns(UserWarning, match="every episode counts as one"):
+        buffer = load_dataset([episode] * 3, action_space=spaces.Discrete(2))
+    assert buffer.episode_lengths.tolist() == [5, 5, 5]
 
 
 def test_steps_without_an_array_or_an_end_are_named():

@@ -113,7 +113,7 @@ def test_whole_numbers_of_any_size_are_observed(dtype, tmp_path):
     info = json.loads((Path(write(tmp_path / "arm", **touch)) / "meta" / "info.json").read_text())
     info["features"]["observation.note"] = {"dtype": "string", "shape": [1], "names": None}
     (tmp_path / "arm" / "meta" / "info.json").write_text(json.dumps(info))
-    with pytest.warns(UserWarning, match=r"arm: neither numbers nor images, and not read: observation\.note \(string\)\."):
+    with pytest.warns(UserWarning, match=r"arm: neither vectors nor images, and not read: observation\.note \(string\)\."):
         buffer = load_dataset(tmp_path / "arm")
     assert buffer.observations[:, 2].tolist() == list(range(12))
 

@@ -139,17 +139,27 @@ def test_dense_rewards_are_kept(path):
     demo["rewards"] = np.array([0.125, 0.5, 1.0, 1.0])
     buffer = load_robomimic(write(path, {"demo_0": demo}, env_args(reward_shaping=True)))
     assert buffer.rewards.tolist() == [0.125, 0.5, 1.0, 1.0]
-    assert (buffer.terminated.tolist(), buffer.truncated.tolist()) == ([False], [True])
+    assert (buffer.terminated.tolist(), buffer.successes.tolist()) == ([True], [1.0])
+
+
+OWN = {"env_name": "MyEnv-v0", "type": 2, "env_kwargs": {}}
 
 
 @pytest.mark.parametrize("rewards", [[5.0, 5.0], [0.0, 0.9], [-1.0, 0.0], [1.0, 1.0]])
 def test_dense_rewards_tell_of_no_success(rewards, path):
-    write(path, {"demo_0": {**make_demo(2), "rewards": np.array(rewards)}})
+    write(path, {"demo_0": {**make_demo(2), "rewards": np.array(rewards)}}, OWN)
     buffer = load_dataset(path)
     assert buffer.rewards.tolist() == pytest.approx(rewards)
     assert np.isnan(buffer.successes).all()
     with pytest.raises(DatasetError, match=r"of 1 of 1 episodes the data do not tell whether they succeeded"):
         load_dataset(path, success_only=True)
+
+
+def test_a_demonstration_that_begins_with_success_leaves_the_others_alone(path):
+    demos = {"demo_0": make_demo(5, success_at=2), "demo_1": {**make_demo(3), "rewards": np.ones(3)}}
+    buffer = load_robomimic(write(path, demos))
+    assert buffer.episode_lengths.tolist() == [3, 1]
+    assert buffer.terminated.all()
 
 
 @pytest.mark.parametrize("dtype", ["S", "O"])
@@ -365,9 +375,6 @@ def test_actions_outside_of_the_controllers_range_can_be_clipped(path):
     write(path, {"demo_0": demo})
     assert "action 1.5 in dimension 0" in refused(path)
     assert load_robomimic(path, clip_actions=True).actions.max() == 1.0
-
-
-OWN = {"env_name": "MyEnv-v0", "type": 2, "env_kwargs": {}}
 
 
 def test_the_range_of_others_environments_is_given(path, tmp_path):

@@ -96,7 +96,9 @@ def test_numbered_columns_come_by_their_numbers(write):
     assert load_dataset(write({**numbered, **rest})).observations[0].tolist() == [0, 2, 10]
     matrix = {f"obs_{i}_{j}": [10.0 * i + j] * 5 for j in range(2) for i in (1, 0)}
     others = {"obs_next_0": [9.0] * 5, "action_probability": [9.0] * 5}
-    buffer = load_dataset(write({**matrix, **others, "action_0": COLUMNS["action"], "episode": COLUMNS["episode"]}))
+    table = {**matrix, **others, "action_0": COLUMNS["action"], "episode": COLUMNS["episode"], "reward": COLUMNS["reward"]}
+    with pytest.warns(UserWarning, match="action_0 are read, and not action_probability"):
+        buffer = load_dataset(write(table))
     assert buffer.observations[0].tolist() == [0, 1, 10, 11]
     assert buffer.actions.shape == (5, 1)
     named = {f"state.{name}": [float(number)] * 5 for number, name in enumerate(("speed", "angle_2"))}

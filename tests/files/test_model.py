@@ -182,7 +182,7 @@ def test_a_pickled_model_runs_nothing_unless_it_is_trusted(saved, tmp_path):
                 load(tmp_path / "evil.zip")
     assert RAN == []
     SAC("MlpPolicy", "Pendulum-v1", buffer_size=1).save(tmp_path / "agent.zip")
-    with pytest.raises(ModelFileError, match=r"agent.zip: saved by another algorithm: its policy is of stable"):
+    with pytest.raises(ModelFileError, match=r"agent.zip: saved by another algorithm, one of stable_baselines3"):
         DTFM.load(tmp_path / "agent.zip")
     with pytest.raises(ValueError, match=r"policy is SACPolicy, which belongs to another algorithm than DTFM"):
         DTFM.load(tmp_path / "agent.zip", allow_pickle=True)

@@ -90,7 +90,7 @@ def test_a_file_that_is_no_policy_is_refused(tmp_path, capsys):
     graph.metadata_props.add(key="sb3_dtfm", value="{}")
     onnx.save(graph, tmp_path / "ours.onnx")
     assert record(tmp_path / "ours.onnx") == 2
-    assert "ours.onnx was exported by sb3-dtfm: name the model that was exported" in capsys.readouterr().err
+    assert "ours.onnx was exported by sb3-dtfm: name the run of the model that was exported" in capsys.readouterr().err
     (tmp_path / "text.onnx").write_text("no graph")
     assert record(tmp_path / "text.onnx") == 2
     assert "text.onnx is no ONNX file that can be run" in capsys.readouterr().err
