@@ -112,8 +112,11 @@ def test_whole_numbers_of_any_size_are_observed(dtype, tmp_path):
     touch = {"observation.touch": np.arange(12, dtype=dtype), "observation.state": None}
     info = json.loads((Path(write(tmp_path / "arm", **touch)) / "meta" / "info.json").read_text())
     info["features"]["observation.note"] = {"dtype": "string", "shape": [1], "names": None}
+    info["features"]["observation.depth"] = {"dtype": "uint16", "shape": [480, 640], "names": None}
     (tmp_path / "arm" / "meta" / "info.json").write_text(json.dumps(info))
-    with pytest.warns(UserWarning, match=r"arm: neither vectors nor images, and not read: observation\.note \(string\)\."):
+    with pytest.warns(
+        UserWarning, match=r"arm: neither vectors nor images, and not read: observation\.note \(string\), observation"
+    ):
         buffer = load_dataset(tmp_path / "arm")
     assert buffer.observations[:, 2].tolist() == list(range(12))
 

@@ -86,6 +86,25 @@ def test_without_a_state_all_numbers_are_observed(images, arrays, tmp_path):
     assert set(buffer.image_spaces) == ({"img"} if images else set())
 
 
+def test_beside_a_camera_the_numbers_that_the_environment_shows_are_observed(arrays, tmp_path):
+    """An environment of images alone shows no numbers, whatever else was recorded."""
+    del arrays["data/state"]
+    path = write(tmp_path / "push.zarr", {**arrays, "data/timestamp": np.arange(8.0)[:, None]})
+    image = spaces.Box(0, 255, (8, 8, 3), np.uint8)
+    for space, expected in ((image, [0.0] * N), (spaces.Dict(img=image, timestamp=spaces.Box(0, 9, (1,))), list(range(N)))):
+        with pytest.warns(UserWarning, match=r"are observed, (timestamp|nothing else) is not; observation_keys="):
+            buffer = load_dataset(path, action_bounds=(0, 512), observation_space=space)
+        assert buffer.observations[:, 0].tolist() == expected
+
+
+def test_successes_are_read(arrays, tmp_path):
+    arrays["data/success"] = np.eye(1, N, N - 1)[0]
+    buffer = load_dataset(write(tmp_path / "push.zarr", arrays), action_bounds=(0, 512))
+    assert buffer.successes.tolist() == [0.0, 1.0]
+    assert buffer.episode_returns.tolist() == [0.0, 1.0]
+    assert buffer.terminated.tolist() == [False, True]
+
+
 def test_whole_floats_are_ends_and_a_float_is_an_action_of_one_number(arrays, tmp_path):
     arrays |= {"data/action": arrays["data/action"][:, 0], "meta/episode_ends": np.array(ENDS, float)}
     buffer = load(write(tmp_path / "push.zarr", arrays))
