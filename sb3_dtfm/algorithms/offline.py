@@ -318,8 +318,6 @@ class OfflineAlgorithm(SequenceModel):
                 self.dump_logs()
             callback.update_locals(locals())
             if not parallel.broadcast(callback.on_step()):
-                if log_interval and self.num_timesteps % log_interval and self.num_timesteps < total_timesteps:
-                    self.dump_logs()
                 break
         self._check_finite(self._means.sums(), self._means.n_values)
         callback.on_training_end()

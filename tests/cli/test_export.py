@@ -84,7 +84,7 @@ def test_mistakes_end_in_a_line(exported, tmp_path, capsys):
     for arguments, message in [
         ([str(tmp_path / "none.zip")], "none.zip: No such file"),
         ([str(tmp_path)], "no folder of a run"),
-        ([str(tmp_path / "ppo.zip")], "pickled"),
+        ([str(tmp_path / "ppo.zip")], "saved by another algorithm, one of stable_baselines3"),
         ([str(model), "--acting", "flow_solver:'warp'"], "flow_solver must be one of"),
         ([str(model), "-o", str(tmp_path / "ppo.zip" / "policy.onnx")], "policy.onnx: File exists"),
     ]:
