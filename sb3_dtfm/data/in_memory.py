@@ -104,7 +104,7 @@ def _parts(step: Sequence[Any]) -> list[Any]:
     """Return what a step begins with, without its info, and without what comes after the flags."""
     n_first, n_most = len(SHORT_STEP), len(STEP) + 1
     parts = [*step[:n_first], *(part for part in step[n_first:] if not isinstance(part, Mapping))][:n_most]
-    return parts[:-1] if len(parts) == n_most and isinstance(parts[-1], Sequence) else parts
+    return parts[:-1] if len(parts) == n_most and (isinstance(parts[-1], Sequence) or np.size(parts[-1]) != 1) else parts
 
 
 def load_steps(

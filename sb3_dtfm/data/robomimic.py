@@ -159,16 +159,16 @@ def _read(
             refused[name] = error
     if not refused:
         _check_count(data, "total", sum(demo.n_steps for demo in labels.values()), source)
-    of_robosuite = _is_robosuite(env_args)
-    rewards, tells_success = _rewards(labels, of_robosuite)
+    env_id = _env_id(env_args, source, *meant_for)
     if not any(demo.rewards is not None and demo.rewards.any() for demo in labels.values()):
         all_zero = any(demo.rewards is not None for demo in labels.values())
         warn_of_made_up_rewards((), source, "there is no reward but 0" if all_zero else "there are no rewards")
-    env_id = _env_id(env_args, source, *meant_for)
     n_actions = next((labels[name].n_actions for name in demos if name in labels), None)
     if n_actions is None:
         raise refused[demos[0]]
     action_space = _action_space(env_args, n_actions, bounds, source)
+    of_robosuite = _is_robosuite(env_args)
+    rewards, tells_success = _rewards(labels, of_robosuite)
 
     def trajectory(name: str) -> Trajectory:
         if name in refused:
