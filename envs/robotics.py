@@ -32,8 +32,8 @@ def register_gymnasium_robotics() -> None:
     except ImportError:
         return
     except AttributeError as error:  # MuJoCo's, of a library for rendering that is missing
-        how = f"MUJOCO_GL={os.environ.get('MUJOCO_GL')}"
-        warnings.warn(f"MuJoCo cannot be imported with {how} ({error}): is its library installed?", stacklevel=2)
+        how = f"MUJOCO_GL={os.environ.get('MUJOCO_GL', '')}"
+        warnings.warn(f"MuJoCo cannot be imported with {how} ({error}): is the rendering library installed?", stacklevel=2)
         return
     gym.register_envs(gymnasium_robotics)
 

@@ -6,6 +6,7 @@ environment comes from this package; `Policy` needs nothing of it, and goes wher
 """
 
 import argparse
+import ast
 import json
 import time
 import zlib
@@ -40,7 +41,7 @@ class Policy:
         The next action, as `predict(deterministic=True)` chooses it; time step 0 begins an episode.
 
         :param observation: (O,)
-        :param return_to_go: target return less the rewards so far, or more where an episode is ahead of it
+        :param return_to_go: target return minus the rewards so far, at least target * (1 - t / T)
         :param timestep: counted from the episode's start
         :param images: by camera, uint8 of (height, width, channels), or channels first
         :return: (A,) in the environment's range, or a number where its action space is Discrete
@@ -73,6 +74,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Play episodes with an exported policy.")
     parser.add_argument("policy", help="what `sb3-dtfm export` wrote")
     parser.add_argument("--env", help="Gymnasium id; what the file says by default")
+    parser.add_argument("--env-kwargs", nargs="+", default=[], metavar="NAME:VALUE", help="such as cameras:['agentview']")
     parser.add_argument("--target-return", type=float, help="in reward units; by default the file's")
     parser.add_argument("--episodes", type=int, default=10, help="10 by default")
     parser.add_argument("--seed", type=int, default=0, help="of the first initial state")
@@ -86,8 +88,12 @@ def main() -> None:
     env_id = options.env or policy.settings["env_id"]
     target = policy.settings["target_return"] if options.target_return is None else options.target_return
     if env_id is None or target is None:
-        parser.error("the file does not say for which task it is: give --env and --target-return")
-    env = ReturnToGoWrapper(gymnasium.make(env_id), target)  # makes vectors, and counts what is left of the return
+        parser.error("the file lacks a task or a target return: give --env and --target-return")
+    given = (each.partition(":") for each in options.env_kwargs)
+    env_kwargs = {name: ast.literal_eval(value) for name, _, value in given}
+    env = ReturnToGoWrapper(
+        gymnasium.make(env_id, **env_kwargs), target
+    )  # makes vectors, and counts what is left of the return
     for episode in range(options.episodes):
         observation, info = env.reset(seed=options.seed + episode)
         total, timestep, done, milliseconds = 0.0, 0, False, []

@@ -47,7 +47,9 @@ def main(argv: Sequence[str]) -> None:
     if "-optimize" in rest or "--optimize-hyperparameters" in rest:
         raise UsageError("-optimize: hyperparameters of finetune cannot be searched; -params changes them.")
     if options.dataset:
-        raise UsageError("--dataset: the DTFM's own dataset is taken; -params dataset:... names another for --algo dtfm.")
+        raise UsageError(
+            "--dataset: refused, as the DTFM's own dataset is used; -params dataset:... names another for --algo dtfm."
+        )
     config = options.conf_file or finetuning_config(options.algo)
     if options.gym_packages:
         rest += ["--gym-packages", *options.gym_packages]

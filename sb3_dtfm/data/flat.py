@@ -61,7 +61,9 @@ def warn_of_made_up_rewards(
     told = names & set(SUCCESSES)
     if told and not unread:
         return
-    counts = "so that a success is rewarded" if told else "nor any success, so that every episode counts as one, rewarded"
+    counts = (
+        "so that a success is rewarded" if told else "nor any success, so that every episode counts as a success, rewarded"
+    )
     not_read = f" Not read: {', '.join(unread)}." if unread else ""
     warnings.warn(f"{source}: {missing}, {counts} by 1 at its last step.{not_read}", stacklevel=2)
 

@@ -289,10 +289,10 @@ def _arrays_of_episode(episode: Any, where: str) -> Mapping[str, Any]:
         return {**arrays, **({"rews": episode.rews} if hasattr(episode, "rews") else {})}
     if is_episodes(episode) and len(episode) and all(_is_step(step) for step in episode):
         return _arrays_of_steps(episode, where)
-    steps = "; ".join(", ".join(names) for names in (STEP, SHORT_STEP))
+    steps = " or ".join(f"({', '.join(names)})" for names in (STEP, SHORT_STEP))
     raise DatasetError(
         f"{where} is a {type(episode).__name__}; accepted are a dictionary of arrays, a Trajectory, a trajectory of "
-        f"imitation, or a list of steps ({steps}; the next observation may stand beside the reward)."
+        f"imitation, or a list of steps {steps}, with the next observation before or behind the reward."
     )
 
 

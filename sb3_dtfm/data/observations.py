@@ -170,7 +170,7 @@ def check_order(
     unknown = [key for key in keys if key not in cameras and key not in shown]
     if isinstance(keys, Mapping) and unknown:
         raise DatasetError(
-            f"{source}: observation_keys names {', '.join(unknown)}; the environment's numbers are {', '.join(shown)}."
+            f"{source}: observation_keys has {', '.join(unknown)}; the environment's names are {', '.join(shown)}."
         )
     known = [key for key in keys if key in shown]
     if not isinstance(keys, Mapping) and known != sorted(known):

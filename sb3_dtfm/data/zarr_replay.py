@@ -269,9 +269,10 @@ def _chosen(
         if not keys:
             raise DatasetError(f"{source}: data has nothing to observe, only {', '.join(sorted(data))}.")
         if images and vector is None and others:
-            unread = ", ".join(sorted(others - shown)) or "nothing else"
+            unread = ", ".join(sorted(others - shown)) or "none"
             warnings.warn(
-                f"{source}: {', '.join(keys)} are observed, {unread} is not; observation_keys=[...] chooses.", stacklevel=3
+                f"{source}: observed: {', '.join(keys)}; not observed: {unread}. observation_keys=[...] chooses.",
+                stacklevel=3,
             )
     found = {}
     # The environment shows its entries in the order of their names.
@@ -297,6 +298,6 @@ def _read(array: Any, steps: slice, columns: slice, where: str) -> np.ndarray:
     if not (images == values).all():
         raise DatasetError(
             f"{where}: images of {values.dtype} hold others than whole numbers from 0 to 255; scale them and store uint8, "
-            "or name what else is observed, observation_keys=[...]."
+            "or leave them out with observation_keys=[...]."
         )
     return images

@@ -105,7 +105,7 @@ class OfflineExperimentManager(ExperimentManager):
                 self.save_path, self.params_path = str(resumed), str(resumed / self.env_name)
         self.has_checkpoint = resumed is not None and (resumed / CHECKPOINT).is_file()  # else it begins anew
         if resumed is not None and not self.has_checkpoint and is_first_process():
-            print(f"{resumed} was interrupted before its first {CHECKPOINT}: it begins anew.", flush=True)
+            print(f"{resumed} was interrupted before its first checkpoint: training begins anew.", flush=True)
         if resumed is not None and self.has_checkpoint:
             self.trained_agent, self.continue_training = str(resumed / CHECKPOINT), True
 

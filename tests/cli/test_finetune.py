@@ -257,7 +257,7 @@ def test_a_run_that_ended_before_its_first_checkpoint_begins_anew(run, workplace
     undo_checkpoints(online)
     n_updates = DTFM.load(online / "HalfCheetah-v5")._n_updates
     assert main(["finetune", "--resume", str(online)]) == 0
-    assert "was interrupted before its first checkpoint.zip: it begins anew" in capsys.readouterr().out
+    assert "was interrupted before its first checkpoint: training begins anew" in capsys.readouterr().out
     model = DTFM.load(online / "HalfCheetah-v5")
     assert (model.num_timesteps, model._n_updates) == (40, n_updates + 2)
     assert load_dataset(online / "episodes.npz").n_episodes == 2
@@ -288,7 +288,7 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
         "--model nowhere": "nowhere does not exist; --model names a DTFM's zip file or its run's folder.",
         "--model logs/dt/HalfCheetah-v5_1": "was saved by 'DT', not by DTFM.",
         "--model agent.zip": "agent.zip: saved by another algorithm, one of stable_baselines3.",
-        f"--model {run} --algo dtfm --dataset more.npz": "--dataset: the DTFM's own dataset is taken; -params dataset:...",
+        f"--model {run} --algo dtfm --dataset more.npz": "--dataset: refused, as the DTFM's own dataset is used",
         "--model untold.zip": "--target-return R: needed, as untold.zip was saved without one; `sb3-dtfm inspect DATASET` ",
         f"--model {run} --algo td3": "--algo td3: no packaged settings; those of dtfm, ppo, sac, tqc are.",
         "--model alone.zip --algo dtfm --target-return 3": "dataset:...: needed, as alone.zip does not tell what it learned",

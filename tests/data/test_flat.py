@@ -107,7 +107,9 @@ def test_terminals_alone_do_not_tell_of_timeouts(path):
 
 
 def test_without_rewards_every_episode_is_a_success(path):
-    with pytest.warns(UserWarning, match=r"none of rewards, .*, nor any success, so that every episode counts as one, rewa"):
+    with pytest.warns(
+        UserWarning, match=r"none of rewards, .*, nor any success, so that every episode counts as a success, rewa"
+    ):
         buffer = load_flat(write(path, rewards=None))
     assert buffer.rewards.tolist() == [0, 1, 0, 0, 1, 0, 0, 0, 1]
     assert buffer.terminated.all()

@@ -218,7 +218,7 @@ def test_demonstrated_steps_of_dictionary_observations_need_no_reward(camera):
         {"observation": {"joints": np.float32([k, -k]), **frames}, "action": np.float32([0.1, 0.2]), "done": k in (3, 9)}
         for k in range(10)
     ]
-    with pytest.warns(UserWarning, match="every episode counts as one"):
+    with pytest.warns(UserWarning, match="every episode counts as a success"):
         buffer = load_dataset(steps)
     assert buffer.episode_lengths.tolist() == [4, 6]
     assert buffer.observations[:, 0].tolist() == list(range(10))
@@ -265,7 +265,7 @@ def test_named_tuples_of_other_names_go_by_their_places():
 
 def test_an_episode_of_single_numbers_is_no_step():
     episode = {"obs": {"a": np.zeros(5), "b": np.ones(5)}, "actions": np.array([0, 1, 1, 0, 1]), "terminated": True}
-    with pytest.warns(UserWarning, match="every episode counts as one"):
+    with pytest.warns(UserWarning, match="every episode counts as a success"):
         buffer = load_dataset([episode] * 3, action_space=spaces.Discrete(2))
     assert buffer.episode_lengths.tolist() == [5, 5, 5]
 

@@ -226,6 +226,6 @@ def test_the_time_to_find_episodes_grows_with_their_number_alone():
 
 def test_without_rewards_it_is_said_what_counts(tmp_path):
     with pytest.warns(
-        UserWarning, match=r"arm: there is no feature next.reward or reward of numbers, .* every episode counts as one"
+        UserWarning, match=r"arm: there is no feature next.reward or reward of numbers, .* every episode counts as a success"
     ):
         load_dataset(write(tmp_path / "arm"))

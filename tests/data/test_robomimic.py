@@ -120,7 +120,7 @@ def test_without_rewards_the_first_done_step_is_the_success(path, stored):
         else:
             del demo["rewards"]
     told = "there is no reward but 0" if stored == "zeros" else "there are no rewards"
-    with pytest.warns(UserWarning, match=f"demos.hdf5: {told}, nor any success, so that every episode counts as one"):
+    with pytest.warns(UserWarning, match=f"demos.hdf5: {told}, nor any success, so that every episode counts as a success"):
         buffer = load_robomimic(write(path, demos))
     assert buffer.episode_lengths.tolist() == [6, 4]
     assert buffer.episode_returns.tolist() == [1.0, 1.0]

@@ -36,7 +36,7 @@ def write(path, arrays):
 
 
 def load(path, **kwargs):
-    with pytest.warns(UserWarning, match="every episode counts as one"):
+    with pytest.warns(UserWarning, match="every episode counts as a success"):
         return load_dataset(path, action_bounds=(0, 512), **kwargs)
 
 
@@ -92,7 +92,9 @@ def test_beside_a_camera_the_numbers_that_the_environment_shows_are_observed(arr
     path = write(tmp_path / "push.zarr", {**arrays, "data/timestamp": np.arange(8.0)[:, None]})
     image = spaces.Box(0, 255, (8, 8, 3), np.uint8)
     for space, expected in ((image, [0.0] * N), (spaces.Dict(img=image, timestamp=spaces.Box(0, 9, (1,))), list(range(N)))):
-        with pytest.warns(UserWarning, match=r"are observed, (timestamp|nothing else) is not; observation_keys="):
+        with pytest.warns(
+            UserWarning, match=r"observed: img(, timestamp)?; not observed: (timestamp|none)\. observation_keys="
+        ):
             buffer = load_dataset(path, action_bounds=(0, 512), observation_space=space)
         assert buffer.observations[:, 0].tolist() == expected
 
@@ -124,7 +126,7 @@ REFUSED = {
     ),
     "no pixel": (
         lambda arrays: arrays["data/img"].__setitem__(0, np.nan),
-        r"img: images of float32 hold .*; scale them and store uint8, or name what else is observed, observation_keys=",
+        r"img: images of float32 hold .*; scale them and store uint8, or leave them out with observation_keys=",
     ),
     "rewards": (
         lambda arrays: arrays.update({"data/reward": np.zeros((N, 2))}),
