@@ -91,9 +91,8 @@ def main() -> None:
         parser.error("the file lacks a task or a target return: give --env and --target-return")
     given = (each.partition(":") for each in options.env_kwargs)
     env_kwargs = {name: ast.literal_eval(value) for name, _, value in given}
-    env = ReturnToGoWrapper(
-        gymnasium.make(env_id, **env_kwargs), target
-    )  # makes vectors, and counts what is left of the return
+    # Makes vectors, and counts what is left of the return.
+    env = ReturnToGoWrapper(gymnasium.make(env_id, **env_kwargs), target)
     for episode in range(options.episodes):
         observation, info = env.reset(seed=options.seed + episode)
         total, timestep, done, milliseconds = 0.0, 0, False, []

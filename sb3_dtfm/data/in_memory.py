@@ -65,19 +65,20 @@ def _is_step(found: Any) -> bool:
             return _n_axes(reward) == 0
         if action is None or _n_axes(action) != 1:
             return action is not None and _n_axes(action) == 0
-        return _n_axes(found.get("done", ())) == 0 or _is_single(observation, len(action))
+        ends_itself = any(_n_axes(found[name]) == 0 for name in DONES if name in found)
+        return _is_single(observation, None if ends_itself else len(action))
     if not is_episodes(found) or not len(found):
         return False
     parts = _parts(found)
     return len(parts) >= len(SHORT_STEP) and not isinstance(parts[-1], Mapping | Sequence) and np.size(parts[-1]) == 1
 
 
-def _is_single(observation: Any, n_actions: int) -> bool:
+def _is_single(observation: Any, n_actions: int | None) -> bool:
     """
     Return whether this is an observation of one step, and not one number for each of so many steps.
 
     :param observation: a vector, an image, or a dictionary of such and of numbers
-    :param n_actions: numbers of the action, or steps
+    :param n_actions: numbers of the action, or steps; None if something else tells that it is one step
     """
     if isinstance(observation, Mapping):
         parts = observation.values()

@@ -28,9 +28,9 @@ SYSTEM_INFO = "system_info.txt"
 # Entries that other tools read in a model of Stable-Baselines3.
 SB3_VERSION = "_stable_baselines3_version"
 TENSORS_SUFFIX = ".safetensors"
-# Members of a file that Stable-Baselines3 itself, or an earlier version of this package, has written.
 PICKLED_DATA = "data"  # JSON, of which a part is pickled
-PICKLED = ("data", ".pth", ".pkl", ".pt")
+# Members of a file that Stable-Baselines3 itself, or an earlier version of this package, has written.
+PICKLED = (PICKLED_DATA, ".pth", ".pkl", ".pt")
 OTHER_ALGORITHMS = ("stable_baselines3", "sb3_contrib")  # packages of theirs
 MAX_CONFIGURATION = 2**24  # bytes
 # Errors of a zip file that is damaged, encrypted, newer than zipfile, or points behind its own end.

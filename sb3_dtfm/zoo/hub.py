@@ -238,8 +238,8 @@ def repository_id(options: argparse.Namespace) -> str:
     """
     if options.algo not in ALGORITHMS:
         raise UsageError(
-            f"--algo {options.algo}: accepted are {' and '.join(ALGORITHMS)}. For SB3's algorithms use RL-Zoo's "
-            "push_to_hub and load_from_hub."
+            f"--algo {options.algo}: accepted are {' and '.join(ALGORITHMS)}. RL-Zoo's load_from_hub "
+            "downloads models of SB3's algorithms."
         )
     return ModelRepoId(options.organization, options.repo_name or ModelName(options.algo, options.env))
 

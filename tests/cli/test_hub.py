@@ -146,7 +146,7 @@ def test_a_model_that_holds_pickles_is_refused(repository, capsys):
     ("arguments", "message"),
     [
         (["pull", *MODEL, "--repo-folder", "nowhere"], "nowhere/settings.json does not exist; expected a repository"),
-        (["pull", *MODEL, "--algo", "sac"], "--algo sac: accepted are dt and dtfm. For SB3's algorithms"),
+        (["pull", *MODEL, "--algo", "sac"], "--algo sac: accepted are dt and dtfm. RL-Zoo's load_from_hub downloads"),
         (["push", *MODEL], "The logs/dt folder was not found"),
         (["pull", *MODEL, "--exp-id", "3"], "--exp-id 3: logs/dt/HalfCheetah-v5_3 exists already"),
     ],

@@ -265,9 +265,11 @@ def test_named_tuples_of_other_names_go_by_their_places():
 
 def test_an_episode_of_single_numbers_is_no_step():
     episode = {"obs": {"a": np.zeros(5), "b": np.ones(5)}, "actions": np.array([0, 1, 1, 0, 1]), "terminated": True}
-    with pytest.warns(UserWarning, match="every episode counts as a success"):
-        buffer = load_dataset([episode] * 3, action_space=spaces.Discrete(2))
-    assert buffer.episode_lengths.tolist() == [5, 5, 5]
+    ended = {"obs": np.zeros((5, 3)), "actions": episode["actions"], "done": True}
+    for given in (episode, ended, {**ended, "obs": {"a": np.zeros((5, 3)), "b": np.ones(5)}}):
+        with pytest.warns(UserWarning, match="every episode counts as a success"):
+            buffer = load_dataset([given] * 3, action_space=spaces.Discrete(2))
+        assert buffer.episode_lengths.tolist() == [5, 5, 5]
 
 
 def test_steps_without_an_array_or_an_end_are_named():
