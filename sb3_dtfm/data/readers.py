@@ -18,9 +18,7 @@ from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, load_cached
 from sb3_dtfm.data.flat import fingerprint_flat_file, holds_episodes, is_flat_file, is_mapping, load_flat
 from sb3_dtfm.data.in_memory import (
-    is_episodes,
     is_replay_buffer,
-    is_steps,
     load_episodes,
     load_replay_buffer,
     load_steps,
@@ -30,6 +28,7 @@ from sb3_dtfm.data.minari import fingerprint_minari, is_minari, load_minari
 from sb3_dtfm.data.observations import check_order
 from sb3_dtfm.data.pickles import unpickled, without_pickles
 from sb3_dtfm.data.robomimic import fingerprint_robomimic, is_robomimic, load_robomimic
+from sb3_dtfm.data.steps import is_episodes, is_steps
 from sb3_dtfm.data.trajectories import DatasetError
 from sb3_dtfm.data.zarr_replay import fingerprint_zarr, is_zarr, load_zarr
 
