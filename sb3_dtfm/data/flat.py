@@ -321,11 +321,30 @@ def _ends(arrays: Arrays, n_steps: int, max_episode_steps: int | None) -> _Ends:
             stops = np.append(stops, n_steps)
         if not arrays.has((*TRUNCATIONS, *DONES)):
             stops = _cut(stops, max_episode_steps, arrays)
+    else:
+        _warn_of_inner_ends(terminated | truncated, stops, arrays)
     if max_episode_steps is not None and not arrays.has(TRUNCATIONS):
         late = stops[np.diff(stops, prepend=0) == max_episode_steps] - 1
         terminated[late] &= arrays.has(TERMINATIONS)
         truncated[late] = ~terminated[late]
     return _Ends(stops, terminated, truncated)
+
+
+def _warn_of_inner_ends(ended: np.ndarray, stops: np.ndarray, arrays: Arrays) -> None:
+    """Say that steps inside an episode are flagged as its end, which other arrays contradict."""
+    inner = ended.copy()
+    inner[stops - 1] = False
+    if inner.any():
+        first = int(np.argmax(inner))
+        episode = int(np.searchsorted(stops, first, side="right"))
+        step = first - (stops[episode - 1] if episode else 0)
+        flags = " or ".join(arrays.name(names) for names in (TERMINATIONS, TRUNCATIONS, DONES) if arrays.has(names))
+        borders = next(arrays.name(names) for names in ((ENDS,), (LENGTHS,), EPISODES) if arrays.has(names))
+        warnings.warn(
+            f"{arrays.source}: {flags} tells of an end at {inner.sum()} steps inside episodes, the first one at step {step} of "
+            f"episode {episode}. Episodes end where {borders} says; leave {borders} out if they end earlier.",
+            stacklevel=2,
+        )
 
 
 def _cut(stops: np.ndarray, max_episode_steps: int | None, arrays: Arrays) -> np.ndarray:

@@ -78,6 +78,17 @@ def test_numbers_and_dones_tell_of_episodes(kind, path):
     assert buffer.truncated.tolist() == [False, kind == "dones and timeouts", False]
 
 
+@pytest.mark.parametrize("kind", ["ends", "lengths"])
+def test_flags_inside_an_episode_are_told_of(kind, path):
+    message = "terminals tells of an end at 2 steps inside episodes, the first one at step 1 of episode 1"
+    with pytest.warns(UserWarning, match=f"{message}. Episodes end where episode_{kind} says"):
+        buffer = load_dataset(str(write(path, **ENDS[kind], terminals=flags(1, 3, 6, 8))))
+    assert buffer.episode_lengths.tolist() == [2, 3, 4] and buffer.terminated.tolist() == [True, False, True]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_dataset(str(write(path, **ENDS[kind], terminals=flags(1, 8), timeouts=flags(4))))
+
+
 def test_a_number_that_comes_again_is_no_episode(path):
     with pytest.raises(DatasetError, match=r"episode 4 comes in several places; .* after a stable sort"):
         load_dataset(write(path, episode_ends=None, episode=np.array([4, 4, 5, 5, 5, 4, 4, 4, 4])))
