@@ -61,6 +61,20 @@ def n_lines(path: str) -> int:
     return len((ROOT / path).read_text().splitlines())
 
 
+def readme_sizes(text: str) -> Iterator[Size]:
+    """Lines and rows of README's sections."""
+    sections = dict(part.split("\n", 1) for part in text.split("\n## ")[1:])
+    code = re.compile(r"^```.*?\n(.*?)^```", re.DOTALL | re.MULTILINE)
+    for name, limit in (("Install", 2), ("Quick start", 12)):
+        found = code.search(sections[name])
+        yield Size(
+            f"lines of code in README's {name}", len([line for line in found[1].split("\n") if line]) if found else 0, limit
+        )
+    for name, limit in (("Which algorithm?", 5), ("Results", 8)):
+        yield Size(f"rows in README's {name}", len(re.findall(r"^\|", sections[name], re.MULTILINE)) - 2, limit)
+    yield Size("points of protocol and limits in README", len(re.findall(r"^- ", sections["Results"], re.MULTILINE)), 3)
+
+
 def n_arguments(path: str, name: str) -> int:
     """Arguments that a class's constructor shows to its users."""
     found = (node for node in ast.walk(ast.parse((ROOT / path).read_text())) if isinstance(node, ast.ClassDef))
@@ -80,6 +94,7 @@ def sizes() -> Iterator[Size]:
     pages = [page for page in sorted((ROOT / "docs").rglob("*.md")) if page.name not in GENERATED]
     results = [path for path in (ROOT / "results").rglob("*") if path.is_file()]
     yield Size("lines of README", n_lines("README.md"), 120)
+    yield from readme_sizes((ROOT / "README.md").read_text())
     yield Size("lines of CHANGELOG, until the first release", n_lines("CHANGELOG.md"), 60)
     yield Size("words of docs", sum(words(page.read_text()) for page in pages), 25_000)
     for page in pages:

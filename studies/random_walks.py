@@ -93,7 +93,7 @@ def began_at_start(positions: np.ndarray) -> bool:
 
 
 def cost(model: DTFM) -> None:
-    """Print the milliseconds of an action by the number of candidates that the critic chooses among, in turn."""
+    """Print the milliseconds of an action by the number of samples that the critic chooses among, in turn."""
     wrapper = {"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 1.0}}
     env = make_seeded_envs(ENV_ID, {"env_wrapper": wrapper, "env_kwargs": ENV_KWARGS}, n_envs=1)
     milliseconds: dict[int, list[float]] = {n: [] for n in CANDIDATES}
@@ -101,7 +101,7 @@ def cost(model: DTFM) -> None:
         for n_action_samples, times in milliseconds.items():
             model.policy.set_acting(n_action_samples=n_action_samples)
             times.append(action_ms(model, env, seed))
-    print("| candidates | ms an action |\n| --- | --- |")
+    print("| samples | ms an action |\n| --- | --- |")
     for n_action_samples, times in milliseconds.items():
         print(f"| {n_action_samples} | {np.median(times):.2f} |")
 

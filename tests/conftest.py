@@ -8,7 +8,7 @@ from stable_baselines3.common.utils import set_random_seed
 
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 from sb3_dtfm.envs import ReturnToGoWrapper
-from tests.recorded import minari_folder, workplace  # noqa: F401  (fixtures of the rooms that use the command line)
+from tests.recorded import minari_folder, workplace  # noqa: F401  (fixtures of the packages that use the command line)
 
 # Decision Transformer's own settings at a tiny size; those that the classes have by default are tested beside them.
 TINY_POLICY = dict(

@@ -1,4 +1,4 @@
-"""One recorded dataset for the rooms that work through the command line, and a small training on it."""
+"""One recorded dataset for the packages that work through the command line, and a small training on it."""
 
 import json
 from pathlib import Path

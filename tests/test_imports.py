@@ -116,14 +116,14 @@ def imported_modules(path: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_a_room_imports_only_the_rooms_below_it(part):
+def test_a_package_imports_only_the_packages_below_it(part):
     for path in files(part):
         own = {module for module in imported_modules(path) if module.split(".")[0] == PACKAGE}
         parts = {module.split(".")[1] if "." in module else "" for module in own}
         assert parts <= PARTS[part][1], f"{path.relative_to(ROOT)} imports {sorted(own)}"
 
 
-def test_rooms_form_no_circle():
+def test_packages_form_no_circle():
     """A part comes after all parts that it may import, so that some order has them all."""
     below = {part: allowed - {part, ""} for part, (_, allowed) in PARTS.items()}
     below["zoo"] |= {"algorithms"}  # what "" is: the package's own names
@@ -150,7 +150,7 @@ def test_networks_need_torch_and_numpy_alone():
         assert roots <= standard | {"torch", "numpy", PACKAGE}, path
 
 
-def test_every_module_belongs_to_a_room():
+def test_every_module_belongs_to_a_package():
     known = {path for part in PARTS for path in files(part)} | {
         ROOT / "sb3_dtfm" / name for name in ("__init__.py", "__main__.py")
     }

@@ -213,9 +213,9 @@ class EvaluationCallback(BaseCallback):
             self.rows.unlink(missing_ok=True)  # of an attempt that was killed before its first checkpoint
             self._evaluate(final=False)
         else:
-            self._take_up_rows()
+            self._restore_rows()
 
-    def _take_up_rows(self) -> None:
+    def _restore_rows(self) -> None:
         """Keep an interrupted run's rows up to its checkpoint; steps behind the last row took as long as those before it."""
         rows = [row for row in read_rows(self.rows, torn_end=True) if row["step"] <= self.num_timesteps]
         with replacing(self.rows) as beside:

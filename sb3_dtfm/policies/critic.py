@@ -20,7 +20,7 @@ LEARNING_RATE = 3e-4
 LARGEST_VALUE = 10.0
 # How far apart in the noise table the samples' rows lie, and those that chance chooses by: no divisors of its length.
 SAMPLE_STRIDE, CHOICE_STRIDE, CHOICE_START = 97, 31, 513
-# How fast the spread of advantages follows the batches.
+# Rate at which advantage_std follows the batches.
 STD_SHARE = 0.01
 
 
@@ -159,7 +159,7 @@ class Critic(nn.Module):
 
     def choose(self, gains: th.Tensor, temperature: float, uniform: th.Tensor) -> th.Tensor:
         """
-        One of N actions, with probabilities softmax(gain / (temperature * spread of advantages)); with Q in its place in
+        One of N actions, with probabilities softmax(gain / (temperature * advantage_std)); with Q in its place in
         Hansen-Estruch et al. (2023).
 
         :param gains: (B, N), of :meth:`gains`

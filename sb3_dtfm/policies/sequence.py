@@ -306,7 +306,11 @@ class SequencePolicy(BasePolicy):
         if episode_start is not None:
             lost &= ~episode_start
         if lost.any():
-            self._remembered.warn(f"Time step {timestep[lost][0]} follows none that is known: its past is missing.")
+            step = int(timestep[lost][0])
+            self._remembered.warn(
+                f"predict() got time step {step} without step {step - 1} before it, so the action ignores earlier steps. "
+                f"Pass the state that predict() returned for step {step - 1}."
+            )
         context = push(before, *arrays, episode_start=episode_start, frames=frames)
         context = self._act(context, deterministic)
         action = self._to_environment(context.actions[:, -1])
@@ -402,7 +406,7 @@ class SequencePolicy(BasePolicy):
         :return: as :meth:`decode`
         :raises ValueError: they are not finite
         """
-        context = self._carry_out(context, np.ones(len(chunks), bool), chunks)
+        context = self._with_chunks(context, np.ones(len(chunks), bool), chunks)
         planned = np.concatenate([context.actions[:, -1:], context.plan], axis=1)
         return self._to_environment(planned), context
 
@@ -433,13 +437,13 @@ class SequencePolicy(BasePolicy):
             hidden, keys_values = self._hidden(context, due)
             if hidden is not None:
                 chunks = self._to_chunks(self._choose(context, due, hidden, deterministic))
-        return self._carry_out(context, due, chunks)._replace(keys_values=keys_values)
+        return self._with_chunks(context, due, chunks)._replace(keys_values=keys_values)
 
     def _stop_training(self) -> None:
         if self.training:
             self.set_training_mode(False)  # goes through all modules
 
-    def _carry_out(self, context: Context, due: np.ndarray, chunks: np.ndarray) -> Context:
+    def _with_chunks(self, context: Context, due: np.ndarray, chunks: np.ndarray) -> Context:
         """
         The newest step's actions, and plans for the next ones.
 

@@ -379,13 +379,13 @@ def _shorthands(options: argparse.Namespace, settings: dict[str, Any]) -> list[t
     wanted = {name: value for name, value in of_the_data.items() if value is not None}
     kwargs = {**(settings.get("dataset_kwargs") or {}), **wanted}
     dataset = options.dataset[0] if options.dataset and len(options.dataset) == 1 else options.dataset
-    candidates = [
+    changes = [
         ("--dataset", "dataset", dataset, dataset),
         ("--dataset-fraction", "dataset_kwargs", options.dataset_fraction, kwargs),
         ("--dataset-cache", "dataset_kwargs", options.dataset_cache, kwargs),
         ("--target-return", "env_wrapper", options.target_return, wrapper),
     ]
-    return [(option, f"{key}:{value!r}") for option, key, wanted, value in candidates if wanted is not None]
+    return [(option, f"{key}:{value!r}") for option, key, wanted, value in changes if wanted is not None]
 
 
 def enjoy_parser() -> argparse.ArgumentParser:

@@ -287,7 +287,7 @@ def go_on(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], start: Start)
         if isinstance(callback, EvaluateAtStartAndEnd) and not was_ended:
             callback.go_on(n_steps)
         elif isinstance(callback, EvalCallback) and callback.log_path is not None:
-            _take_up_evaluations(callback, _evaluations(callback), n_steps)
+            _restore_evaluations(callback, _evaluations(callback), n_steps)
             is_due = callback.eval_freq > 0 and callback.n_calls % callback.eval_freq == 0
             was_ended = not isinstance(model, OnlineDTFM) and is_due and n_steps not in callback.evaluations_timesteps
     if start.tensorboard is not None:
@@ -300,7 +300,7 @@ def go_on(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], start: Start)
         model.set_logger(logger)
 
 
-def _take_up_evaluations(callback: EvalCallback, path: Path, num_timesteps: int) -> None:
+def _restore_evaluations(callback: EvalCallback, path: Path, num_timesteps: int) -> None:
     """
     Keep the evaluations up to the checkpoint; the run comes to the others again.
 

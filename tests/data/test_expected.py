@@ -38,11 +38,11 @@ def by_episode(buffer: TrajectoryBuffer) -> np.ndarray:
     return buffer.returns_to_go.view(-1, N_STEPS).numpy()
 
 
-def test_luck_becomes_what_may_be_expected(buffer):
+def test_returns_become_expected_returns(buffer):
     found = by_episode(buffer.with_expected_returns(1, seed=0))
     np.testing.assert_allclose(found[::2, 0], 6.0, atol=0.4)
     np.testing.assert_allclose(found[1::2, 0], 0.76 / 0.14, atol=0.4)
-    # Within the last n steps nothing comes after them, and luck is what was recorded.
+    # Within the last n steps nothing comes after them, and the recorded return stays.
     np.testing.assert_array_equal(found[:, -1], by_episode(buffer)[:, -1])
     assert found[1, -1] == PRIZE
     # The rewards of n steps are those of the episode: what lies n before its end has all of them.

@@ -83,7 +83,8 @@ def test_flags_inside_an_episode_are_told_of(kind, path):
     message = "terminals tells of an end at 2 steps inside episodes, the first one at step 1 of episode 1"
     with pytest.warns(UserWarning, match=f"{message}. Episodes end where episode_{kind} says"):
         buffer = load_dataset(str(write(path, **ENDS[kind], terminals=flags(1, 3, 6, 8))))
-    assert buffer.episode_lengths.tolist() == [2, 3, 4] and buffer.terminated.tolist() == [True, False, True]
+    assert buffer.episode_lengths.tolist() == [2, 3, 4]
+    assert buffer.terminated.tolist() == [True, False, True]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         load_dataset(str(write(path, **ENDS[kind], terminals=flags(1, 8), timeouts=flags(4))))

@@ -193,14 +193,14 @@ def test_solver_can_be_changed_after_training(cheetah_buffer):
     assert isinstance(model.policy, DTFMPolicy)
     observation, _ = make_env().reset(seed=0)
     coarse, _ = model.predict(observation, deterministic=True)
-    model.policy.set_solver("rk4", 100)
+    model.policy.set_acting(flow_solver="rk4", flow_steps=100)
     fine, _ = model.predict(observation, deterministic=True)
-    model.policy.set_solver("heun", 400)
+    model.policy.set_acting(flow_solver="heun", flow_steps=400)
     finest, _ = model.predict(observation, deterministic=True)
     assert not np.array_equal(coarse, fine)
     assert np.allclose(fine, finest, atol=1e-3)
     with pytest.raises(ValueError, match="flow_solver must be one of"):
-        model.policy.set_solver("leapfrog", 3)
+        model.policy.set_acting(flow_solver="leapfrog", flow_steps=3)
 
 
 def test_an_observation_without_return_to_go_is_refused(model):
@@ -323,13 +323,13 @@ def test_one_step_acting_is_one_evaluation_saved_with_the_model(cheetah_buffer, 
     settings = {"flow_solver": "one_step", "flow_steps": 4, "kv_cache": True, "n_action_steps": 1, **ONE_SAMPLE}
     assert loaded.policy.acting_settings() == settings
     assert np.array_equal(roll_plain(model, 8), roll_plain(loaded, 8))
-    model.policy.set_solver("euler", 10)
+    model.policy.set_acting(flow_solver="euler", flow_steps=10)
     assert not np.allclose(roll_plain(model, 8), roll_plain(loaded, 8))
 
 
 def test_a_way_of_acting_that_was_chosen_after_training_is_saved(cheetah_buffer, tmp_path):
     model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=TINY_FLOW_POLICY, seed=0)
-    model.policy.set_solver("heun", 3)
+    model.policy.set_acting(flow_solver="heun", flow_steps=3)
     model.policy.set_acting(kv_cache=True)
     model.save(tmp_path / "model.zip")
     loaded = DTFM.load(tmp_path / "model.zip")
@@ -342,7 +342,7 @@ def test_one_step_acting_needs_a_model_that_learned_it(cheetah_buffer):
     policy_kwargs = {**TINY_FLOW_POLICY, "one_step_policy": False}
     model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=policy_kwargs, seed=0)
     with pytest.raises(ValueError, match="one_step_policy=True"):
-        model.policy.set_solver("one_step")
+        model.policy.set_acting(flow_solver="one_step")
 
 
 def test_the_one_step_network_changes_nothing_else(cheetah_buffer):

@@ -198,18 +198,18 @@ def test_another_action_is_worth_more_where_both_values_say_so():
 
 
 @pytest.mark.parametrize("sample_noise_std", [1.0, 1.5])
-def test_candidates_start_from_noise_as_wide_as_is_said(cheetah_buffer, sample_noise_std):
+def test_samples_start_from_noise_of_sample_noise_std(cheetah_buffer, sample_noise_std):
     policy = make_model(DTFM, cheetah_buffer, policy_kwargs=dict(critic_steps=1)).policy
     policy.set_training_mode(False)
     policy.set_acting(n_action_samples=4, sample_noise_std=sample_noise_std)
     hidden = th.randn(5, policy.network.trunk.embed_dim, generator=th.Generator().manual_seed(0))
     rows = np.arange(5)
     with th.no_grad():
-        candidates, _ = policy._best_of_n(hidden, cheetah_buffer.observations[:5], rows, deterministic=True)
+        samples, _ = policy._best_of_n(hidden, cheetah_buffer.observations[:5], rows, deterministic=True)
         for turn in range(4):
             noise = policy.noise_table[th.from_numpy(rows + SAMPLE_STRIDE * turn) % len(policy.noise_table)]
             width = sample_noise_std if turn else 1.0  # the first is the action without a critic
-            th.testing.assert_close(candidates[:, turn], policy.network.decode(hidden, width * noise))
+            th.testing.assert_close(samples[:, turn], policy.network.decode(hidden, width * noise))
     with pytest.raises(ValueError, match="sample_noise_std"):
         policy.set_acting(sample_noise_std=0.0)
 

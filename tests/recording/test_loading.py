@@ -71,7 +71,7 @@ def copy(run: Path, folder: Path, **config: Any) -> Path:
     return folder
 
 
-@pytest.mark.filterwarnings("error:.*follows none that is known")  # where an environment has nothing more to do
+@pytest.mark.filterwarnings("error:.*without step")  # where an environment has nothing more to do
 def test_a_run_of_ours_is_recorded_with_its_return_to_go(workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys):
     assert main(tiny_training("dtfm", "--dataset", CHEETAH_DATA, "--eval-freq", "-1")) == 0
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(workplace / "datasets"))

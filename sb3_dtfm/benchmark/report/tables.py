@@ -376,5 +376,5 @@ def _sources(group: Group) -> list[str]:
     }
     solvers = {f"{row['flow_solver']}, {row['flow_steps']} steps" for row in finals if row["flow_solver"] is not None}
     versions = {f"torch {row['versions'].get('torch', '?')}" for row in finals}
-    lines += [f"- machines: {'; '.join(sorted(machines))}", f"- solver: {'; '.join(sorted(solvers)) or NONE}"]
+    lines += [f"- machines: {'; '.join(sorted(machines))}", f"- flow solver: {'; '.join(sorted(solvers)) or NONE}"]
     return [*lines, f"- versions: {', '.join(sorted(versions))}"]

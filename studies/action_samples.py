@@ -1,8 +1,8 @@
 """
-Worth of the critic's choice on an arm by how candidates are drawn, and by whom (docs/studies/finetuning.md).
+Worth of the critic's choice on an arm by how samples are drawn, and by whom (docs/studies/finetuning.md).
 
-    python studies/candidates.py --n 16 --noise 1.5 logs/dtfm/robosuite-Can-v0_7/robosuite-Can-v0.zip ...
-    python studies/candidates.py --together models --n 8 ONE.zip TWO.zip THREE.zip
+    python studies/action_samples.py --n 16 --noise 1.5 logs/dtfm/robosuite-Can-v0_7/robosuite-Can-v0.zip ...
+    python studies/action_samples.py --together models --n 8 ONE.zip TWO.zip THREE.zip
 
 Plays final episodes of `sb3-dtfm benchmark`, from the thousandth on with `--first 1000`. `--together models` takes the most
 valuable of what all models draw, by the mean of their critics, `critics` of what the first one draws.
@@ -26,7 +26,7 @@ def choose_together(policies: list[SequencePolicy], draws_of_all: bool) -> None:
     Let the first policy carry out what the mean of all critics finds most valuable.
 
     :param policies: with critics, of the same sizes, without `kv_cache`
-    :param draws_of_all: whose candidates; the first one's alone otherwise
+    :param draws_of_all: whose samples; the first one's alone otherwise
     """
 
     def decide(windows: Windows, rows: np.ndarray, deterministic: bool) -> th.Tensor:
@@ -35,14 +35,14 @@ def choose_together(policies: list[SequencePolicy], draws_of_all: bool) -> None:
             each._best_of_n(newest_hidden(each, windows), seen, rows, deterministic)[0]
             for each in (policies if draws_of_all else policies[:1])
         ]
-        candidates = th.cat(drawn, dim=1)
-        gains = th.zeros(candidates.shape[:2])
+        samples = th.cat(drawn, dim=1)
+        gains = th.zeros(samples.shape[:2])
         for each in policies:
             assert each.critic is not None
             gains += each.critic.gains(
-                each.normalization.scale_observation(seen), candidates[..., : each.critic_horizon * each.action_dim]
+                each.normalization.scale_observation(seen), samples[..., : each.critic_horizon * each.action_dim]
             )
-        return candidates[th.arange(len(rows)), gains.argmax(dim=1)]
+        return samples[th.arange(len(rows)), gains.argmax(dim=1)]
 
     replace_choice(policies, decide)
 
@@ -50,7 +50,7 @@ def choose_together(policies: list[SequencePolicy], draws_of_all: bool) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", nargs="+", type=Path)
-    parser.add_argument("--n", type=int, default=8, help="candidates; 8 by default")
+    parser.add_argument("--n", type=int, default=8, help="samples; 8 by default")
     parser.add_argument("--noise", type=float, default=1.0, help="sample_noise_std; 1 by default")
     parser.add_argument("--env", default="robosuite/Can-v0", help="robosuite/Can-v0 by default")
     parser.add_argument("--together", choices=("models", "critics"))
