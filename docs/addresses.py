@@ -15,7 +15,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("sb3_dtfm", "envs", "zoo_configs")
 FILES = ("*.md", "*.toml", "*.cff", "*.in", "LICENSE", "constraints*.txt")
-# Of a link or an image: whether it is an image, its text, what it leads to beside README, and the place in it.
+# A link or an image: its exclamation mark, its text, the file beside README that it leads to, and the place in that file.
 LINK = re.compile(r"(!?)\[([^\]]*)\]\((?!https?://|#)([^)#\s]+)(#[^)\s]*)?\)")
 
 

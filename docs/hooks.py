@@ -17,7 +17,7 @@ from mkdocs.structure.pages import Page
 ROOT = Path(__file__).parents[1]
 LINK = re.compile(r"(?<=\]\()([^)#\s:]+)(?=[)#])")
 EQUATION = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
-# What docstrings link, as Sphinx writes it.
+# A link of a docstring, in Sphinx's syntax.
 ROLE = re.compile(r":(?:class|func|meth):<code>(~?)([\w.]+)</code>")
 
 

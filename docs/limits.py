@@ -16,7 +16,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[1]
 # Written by a tool, or tables that a test compares with the results.
 GENERATED = ("licences.md", "report.md")
-# What a reader needs to see how recorded steps become a loss; tests/test_training_path.py watches that nothing is missing.
+# Files that turn recorded steps into a loss; tests/test_training_path.py watches that none is missing.
 TRAINING_PATH = (
     "algorithms/offline.py",
     "data/drawing.py",

@@ -1,8 +1,8 @@
 """
 Walk a Unitree Go1 with an exported policy: NumPy and ONNX Runtime alone.
 
-NEVER TRIED ON HARDWARE. It ran in simulation only, and its limits and gains are those of the simulation. Who connects a
-robot hangs it up first and keeps an emergency stop at hand.
+NEVER TRIED ON HARDWARE. It ran in simulation only, and its limits and gains are those of the simulation. Before you
+connect a robot, hang it up and keep an emergency stop at hand.
 
 `python examples/deploy_go1.py policy.onnx --model-file go1.xml --forward 0.5` stands up, walks and lies down in the second
 simulation of docs/howto/go1.md. `Robot` is what hardware code implements; `SimulatedRobot` alone needs this package.

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 # Paths in a picture of the flow, and how far it reaches: what little noise lies beyond only makes the rest small.
 N_PATHS, REACH = 300, 2.2
-# Of the first gradient steps, that the time of the others is told by: at least so many, and so many seconds.
+# Fewest gradient steps and seconds that are timed at first, to predict the time of the others.
 N_TIMED, SECONDS_TIMED = 3, 5.0
 # Seconds to train from which on silence would be a surprise.
 LONG = 1800.0

@@ -4,7 +4,7 @@ Ends of trained models' episodes of Can that fail, to be looked at before a cure
     python studies/can_failures.py logs/dtfm/robosuite-Can-v0_1/robosuite-Can-v0.zip ...
 
 Plays the first hundred final episodes of `sb3-dtfm benchmark`, and sorts them by what happened: whether the can was
-lifted at all, and where the hand first opened afterwards. Where it let go on the way, 64 other draws of a DTFM at that
+lifted at all, and where the hand first opened afterwards. If it let go on the way, 64 other draws of a DTFM at that
 decision tell whether chance decided: printed is the share of them that lets go, too.
 """
 
@@ -22,9 +22,9 @@ from sb3_dtfm.recording.loading import algorithm_of, load_agent
 
 N_EPISODES, N_ENVS, N_DRAWS = 100, 10, 64
 SETTINGS = {"env_wrapper": [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 1.0}}]}
-# Of an observation, in metres: the hand's place along the bins, and the can's height.
+# Indices in an observation of the hand's position along the bins and of the can's height, in metres.
 HAND_Y, CAN_Z = 1, 18
-# Of the script's 200 demonstrations one lets go of the can further from the target.
+# Hand's position in metres; one of the script's 200 demonstrations lets go of the can further from the target.
 RELEASED_Y = 0.3
 LIFTED = 0.04
 ON_THE_WAY = "let go on the way"

@@ -17,7 +17,7 @@ import tempfile
 N_ROUNDS = 3
 RATE = re.compile(r"steps_per_second\s*\|\s*([\d.]+)")
 TRAINING = ["train", "--algo", "dtfm", "--env", "HalfCheetah-v5", "--eval-freq", "-1"]
-# Of each size, the gradient steps of a run and what `sb3-dtfm train` is told beside them.
+# Gradient steps of a run and other arguments of `sb3-dtfm train`, by size.
 SIZES = {
     "width 128": (300, []),
     "paper's size": (
@@ -27,7 +27,7 @@ SIZES = {
 }
 ONE = ["-m", "sb3_dtfm"]
 TWO = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", *ONE]
-# Of each way, `OMP_NUM_THREADS` and how Python starts.
+# `OMP_NUM_THREADS` and Python's arguments, by way.
 WAYS = {
     "one process, one thread": ("1", ONE),
     "one process, two threads": ("2", ONE),

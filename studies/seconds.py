@@ -56,7 +56,7 @@ NAMES = {
     "td3-bc": "TD3+BC",
 }
 ENOUGH = 0.95
-# Of others, whose authors plan for hours. Ours and BC learn for the defaults' steps.
+# Minutes of the other libraries, whose authors plan for hours; DT, DTFM and BC learn for the defaults' steps.
 MINUTES, OUR_STEPS = 5.0, 5_000
 N_EPISODES, N_ENVS = 20, 10
 

@@ -1,4 +1,4 @@
-"""What tests/test_distributed.py starts on two processes with torchrun, and compares with this process alone."""
+"""Runs that tests/test_distributed.py starts on two processes with torchrun, and compares with a single process."""
 
 import itertools
 import sys
@@ -74,7 +74,7 @@ class StopAt(BaseCallback):
 
 
 def run_without_a_seed() -> dict:
-    """What a process sees of a run with `seed=None`, dropout, and a callback that stops it."""
+    """A process's view of a run with `seed=None`, dropout, and a callback that stops it."""
     model = make_model("DTFM", seed=None, policy_kwargs={"dropout": 0.5})
     drawn, dropped = [], []
     batches = model.buffer.batches

@@ -10,7 +10,7 @@ from stable_baselines3.common import callbacks, vec_env
 
 ROOT = Path(__file__).parents[1]
 ROWS = re.findall(r"^\| (?!---)(?!.* test \|$).*", (ROOT / "docs" / "compatibility.md").read_text(), re.MULTILINE)
-# What SB3's vectorised environments are made of.
+# Parts of SB3's vectorised environments.
 PARTS = {"VecEnv", "VecEnvWrapper", "CloudpickleWrapper", "StackedObservations", "StackedDictObservations"}
 OUTPUTS = {"stdout", "log", "csv", "json", "tensorboard"}
 

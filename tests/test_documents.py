@@ -1,8 +1,8 @@
 """
-What README and docs/ show runs, block by block.
+The code of README and docs/ runs, block by block.
 
-Python is run, in the order of its page, in a folder that has what docs/start.md leaves behind. Of shell lines it is known
-that the command's own parser takes them. A comment before a block, `<!-- test: ... -->`, says otherwise:
+Python is run, in the order of its page, in a folder that has what docs/start.md leaves behind. Shell lines are only
+parsed, by the command's own parser. A comment before a block, `<!-- test: ... -->`, says otherwise:
 
 - `run`: the shell lines are run, too;
 - `slow`: run as a slow test only;
@@ -41,7 +41,7 @@ PAGES = ["README.md", "CONTRIBUTING.md", *sorted(str(page.relative_to(ROOT)) for
 MARK = r"<!-- test: (\w+)(?:\. ([^>]*))? -->\n"
 FENCE = re.compile(rf"^( *)(?:{MARK}\1)?```([^\n]*)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 SHELL = ("", "sh")
-# What the fast tests take instead.
+# Smaller numbers that the fast tests take.
 FEWER = {
     "range(30)": "range(3)",
     "learn(1_000)": "learn(2)",
@@ -224,7 +224,7 @@ def understand(words: list[str]) -> None:
 
 
 def understand_baselines(arguments: str) -> None:
-    """What `make baselines` passes on."""
+    """Parse the arguments that `make baselines` passes on."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(ROOT / "studies"))
         command = importlib.import_module("baselines.command")

@@ -1,4 +1,4 @@
-"""What is pinned, and what docs/licences.md says of it."""
+"""Pinned versions, and their licences in docs/licences.md."""
 
 import re
 from pathlib import Path
@@ -21,7 +21,7 @@ def pins(file: str, python: str) -> dict[str, str]:
 
 
 def test_every_pinned_version_has_its_licence_listed():
-    """Of Python 3.11."""
+    """The list is that of Python 3.11."""
     rows = re.findall(r"^\| ([\w.-]+) +\| (\d[^ |+]*)", (ROOT / "docs/licences.md").read_text(), re.MULTILINE)
     assert {canonicalize_name(name): version for name, version in rows} == pins("constraints.txt", "3.11"), "`make licences`"
 

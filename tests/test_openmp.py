@@ -11,7 +11,7 @@ COMMAND = "import os; from sb3_dtfm.cli.main import main; main(['inspect', 'no/s
 
 
 def shown(program: str, told: dict[str, str]) -> str:
-    """What a new process prints last."""
+    """The last word that a new process prints."""
     environment = {name: value for name, value in os.environ.items() if name not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}
     command = [sys.executable, "-c", program + SHOW]
     return subprocess.run(

@@ -1,4 +1,4 @@
-"""What PyPI would be given: README's links and pictures lead to the repository, which the project's metadata name."""
+"""Pages for PyPI: README's links and pictures lead to the repository, which the project's metadata name."""
 
 import re
 import runpy

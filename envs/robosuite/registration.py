@@ -11,7 +11,7 @@ from sb3_dtfm.envs.robosuite.tasks import TASKS
 
 ROBOSUITE_TYPE = 1  # robomimic's number for robosuite's environments
 ROBOTS = ("Panda", ["Panda"])
-# What an action does in our environments: robosuite's names of it, and what it is called in robosuite <= 1.4.
+# Controller of our environments, by robosuite's names; robosuite <= 1.4 had other ones.
 CONTROLLER: dict[str, Any] = {
     "type": "OSC_POSE",
     "output_min": [-0.05] * 3 + [-0.5] * 3,

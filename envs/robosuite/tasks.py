@@ -39,7 +39,7 @@ class RobosuiteTask:
     """
     A task of robosuite, as far as it differs from the others.
 
-    What is observed of its objects is robosuite's `object-state`, and where they lie is drawn by robosuite.
+    Its objects are observed as robosuite's `object-state`, and robosuite draws their places.
 
     :param environment: robosuite's name
     :param horizon: steps after which an unsolved episode is truncated: robomimic's, or 400 for each object to move

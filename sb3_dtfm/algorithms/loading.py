@@ -59,7 +59,7 @@ RETURN_REFERENCE: tuple[Rule, ...] = (
     *(Number(), Number(), Number(), COUNT, BOOLEAN),
     *(Number(low=0, high=1, optional=True), Number(optional=True)),
 )
-# Of the policy's tensors.
+# Scales and deviations among the policy's tensors.
 POSITIVE_BUFFERS = {
     "normalization.observation_std",
     "normalization.return_scale",

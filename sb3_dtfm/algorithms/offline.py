@@ -62,7 +62,7 @@ class OfflineAlgorithm(SequenceModel):
     """
     Learn a sequence policy from recorded episodes: `learn(total_timesteps)` counts gradient steps.
 
-    Where `torch.distributed` is initialised, its processes train one model together; callbacks, logs and `save` are those
+    If `torch.distributed` is initialised, its processes train one model together; callbacks, logs and `save` are those
     of process 0. Arguments that are not described here are :class:`~sb3_dtfm.algorithms.options.TrainingOptions`.
 
     :param policy: "MultiInputPolicy", "MlpPolicy" or "CnnPolicy" (all alike), or a policy class
@@ -278,7 +278,7 @@ class OfflineAlgorithm(SequenceModel):
         """
         Train for `total_timesteps` gradient steps; callbacks run once after each.
 
-        Of several processes, all call this alike, and the callbacks run on process 0; it stops all when they stop it.
+        Several processes all call this alike; callbacks run on process 0, which stops all when a callback stops it.
 
         :param total_timesteps: gradient steps
         :param callback: SB3 callback or list of callbacks

@@ -24,9 +24,9 @@ SPACES = ("observation_space", "action_space")
 ENCODED = {*SPACES, "policy_class", "learning_rate", "_means"}
 
 
-# Of `dataset_kwargs`: whoever loads a model says where a cache may lie and whether a pickle may run.
+# Options of `dataset_kwargs` that only the loading user may choose: where a cache lies and whether a pickle may run.
 NEVER_SAVED = ("cache_dir", "allow_pickle")
-# Of `features_extractor_kwargs`: a file that only the first training needs.
+# `weights` among `features_extractor_kwargs` is a file that only the first training needs.
 EXTRACTOR, EXTRACTOR_KWARGS, WEIGHTS = "features_extractor_class", "features_extractor_kwargs", "weights"
 
 

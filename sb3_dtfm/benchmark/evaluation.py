@@ -268,7 +268,7 @@ class EvaluationCallback(BaseCallback):
 
     def _report(self, what: str) -> None:
         """
-        Say how far the run is. Where the grid that reads it is gone, the pipe is broken, and the run ends with it.
+        Say how far the run is. If the grid that reads it is gone, the pipe is broken, and the run ends.
 
         :raises BrokenPipeError: the grid is gone
         """

@@ -1,8 +1,8 @@
 """
 Results: what each evaluation came to, as a line of a CSV table or as summed up from a row of `sb3-dtfm benchmark`.
 
-A result has means and counts in place of a row's lists of episodes: all that reports need. What is the same for a whole run,
-from the commit to the data, stands with its final evaluation alone.
+A result has means and counts in place of a row's lists of episodes: all that reports need. The fields of a whole run, from
+the commit to the data, stand with its final evaluation alone.
 """
 
 import csv

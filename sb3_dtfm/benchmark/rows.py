@@ -17,7 +17,7 @@ KEYS: dict[str, tuple[type, ...]] = {
     **dict.fromkeys(("flow_solver", "commit"), (str, type(None))),
     **dict.fromkeys(("versions", "hardware", "settings", "data"), (dict,)),
 }
-# What earlier rows do not tell, and the Gymnasium id where the task has another name.
+# A key that earlier rows lack, and the Gymnasium id of a task with another name.
 OPTIONAL_KEYS: dict[str, tuple[type, ...]] = {"action_ms": (float, int), "env_id": (str,)}
 EPISODE_KEYS: dict[str, tuple[type, ...]] = {"returns": (float, int), "lengths": (float, int), "successes": (bool,)}
 

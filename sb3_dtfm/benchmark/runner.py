@@ -90,7 +90,7 @@ class Runner:
         """
         A folder with a run's settings, new for each attempt: an orphan may still be writing into an older one.
 
-        What the last attempt had come to is copied, if its settings were the same.
+        The last attempt's files are copied if its settings were equal.
         """
         logs, options, env_id = Path(self.options.log_folder) / job.key.file_name, self.options, job.task.env_id
         logs.mkdir(parents=True, exist_ok=True)

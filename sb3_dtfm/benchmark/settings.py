@@ -17,7 +17,7 @@ from sb3_dtfm.zoo.registration import packaged_config, policy_of, with_policy_op
 PROFILES = {"default": None, "paper": "paper"}
 # Keys of the grid; a profile or `-params` that sets them would contradict it.
 GRID_KEYS = ("seed",)
-# Of `dataset_kwargs`.
+# Keys of `dataset_kwargs` that the grid sets, too.
 GRID_DATASET_KEYS = ("fraction", "fraction_seed")
 # Keys that RL-Zoo takes for itself; the others go to the constructor.
 ZOO_KEYS = {"n_timesteps", "n_envs", "normalize", "env_kwargs", "env_wrapper", "vec_env_wrapper", "callback", "frame_stack"}

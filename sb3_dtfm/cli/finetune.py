@@ -15,7 +15,7 @@ EXAMPLES = """\
   sb3-dtfm finetune --model logs/dtfm/HalfCheetah-v5_1 --env HalfCheetah-v5 --algo ppo -n 1000000
   sb3-dtfm enjoy --algo finetuned --env robosuite/Lift-v0 --load-best
 """
-# Of a run, beside those at its beginning and end.
+# Default number of evaluations in a run, beside those at its beginning and end.
 EVALUATIONS_OF_A_RUN = 10
 
 

@@ -19,7 +19,7 @@ RL-Zoo's own scripts, each with its arguments, `--help` among them:
   sb3-dtfm plot plot_train -a sac -e HalfCheetah-v5 -f logs                  training episodes, which dt and dtfm do not have
 Their figures are windows; with --figures FOLDER, or without a screen, they are PNG files.
 """
-# Of RL-Zoo.
+# RL-Zoo's plotting scripts.
 SCRIPTS = ("all_plots", "plot_from_file", "plot_train")
 COLORS = {"evaluation": "#1b6ca8", "loss": "#c0562b"}
 

@@ -27,7 +27,7 @@ PICKLE = (
     "a pickle of Python objects, which can run code when it is read. From people you trust, "
     "dataset=load_dataset(path, allow_pickle=True) reads it all the same."
 )
-# Of what is no file.
+# Expectation in errors of data that come from no file.
 NUMBERS_EXPECTED = "arrays of numbers are expected"
 # The name of what TrajectoryBuffer.save writes of the environment.
 ENV_ID = "env_id"

@@ -31,7 +31,7 @@ EPISODES = "episodes.npz"
 SPACES = ("observation_space", "action_space")
 # Files of more bytes than this are checked in the background; reading takes about a second for 2**30.
 LARGE = 2**26
-# What numpy raises for a file that is missing, empty, cut off, or of another kind.
+# NumPy's errors for a file that is missing, empty, cut off, or of another kind.
 READ_ERRORS = (OSError, EOFError, LookupError, TypeError, ValueError, zipfile.BadZipFile)
 
 

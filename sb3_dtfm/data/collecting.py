@@ -20,9 +20,9 @@ from sb3_dtfm.data.trajectories import (
     check_trajectory,
 )
 
-# What may become of an episode that is refused.
+# Ways to treat an invalid episode.
 ON_INVALID = ("raise", "drop")
-# What a check makes of episodes: their rows of the table, and the returns-to-go of their steps.
+# Result of checking episodes: their rows of the table, and the returns-to-go of their steps.
 Checked = tuple[EpisodeTable, np.ndarray]
 
 

@@ -132,7 +132,7 @@ def _by_reward(buffer: TrajectoryBuffer) -> list[Decision]:
     Decide whether returns to go are those to be expected from an observation, instead of the recorded ones.
 
     With returns expected after 50 steps three mediocre cheetahs with noise return 4,760 and 4,383 (two seeds) instead of
-    4,237, both with a bounded return-to-go. Where a reward only tells of success, success may be expected from everywhere: a
+    4,237, both with a bounded return-to-go. If a reward only tells of success, success may be expected from everywhere: a
     maze of random walks is solved in 1 % instead of 27 %. Nor may failure be: of cans of which every second one is dropped,
     a policy with `return_range` puts away 70 %, without it 96 %; the maze is solved in 27 and 44 %.
     """

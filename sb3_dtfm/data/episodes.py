@@ -71,7 +71,7 @@ class EpisodeTable(NamedTuple):
         """
         Combine the statistics of all episodes of the table, without a look at their steps (Chan et al., 1979).
 
-        Where agents of several kinds are mixed, one that rolls on its back stretches the standard deviation of the pitch
+        If agents of several kinds are mixed, one that rolls on its back stretches the standard deviation of the pitch
         tenfold, and the pitch of the others is lost in the input's third digit. The robust deviation is the lower quartile
         over episodes of the root mean square distance of an episode's steps from the median episode's mean.
         """

@@ -24,7 +24,7 @@ from sb3_dtfm.data.trajectories import ActionRangeError, DatasetError, Trajector
 from sb3_dtfm.envs.return_to_go import CHANNELS, IMAGE
 from sb3_dtfm.envs.success import SUCCESS
 
-# What others call the same array: the first that is there is read.
+# Names of each array in other libraries' files: the first that is there is read.
 OBSERVATIONS = ("observations", "observation", "obs", "states", "state")
 ACTIONS = ("actions", "action", "acts")
 REWARDS = ("rewards", "reward", "rews")
@@ -36,9 +36,9 @@ DONES = ("dones", "done")
 # The number, or the name, of each step's episode.
 EPISODES = ("episode", "episode_id", "episode_ids", "episode_index")
 SUCCESSES = ("successes", *SUCCESS, *(f"infos/{name}" for name in SUCCESS))
-# What TrajectoryBuffer.save adds, beside ENV_ID.
+# Arrays that TrajectoryBuffer.save adds, beside ENV_ID.
 LOW, HIGH = "action_low", "action_high"
-# What is often beside, and tells nothing more.
+# Arrays that files often hold, and that add no information.
 NOT_NEEDED = ("next_observations", "next_obs", "info", "infos", "metadata")
 
 
@@ -142,7 +142,7 @@ def load_flat(
     Read are `observations` (N, O), `actions` (N, A), or whole numbers (N,) of a Discrete space, and `rewards` (N,), or what
     others call them (`obs`, `state`, `action`, `reward`). Episodes end where `episode_ends` says (E,), counting steps from
     the start of the file, or after `episode_lengths` (E,) each, or where `episode` (N,) changes, or at the steps of
-    `terminals`, `timeouts` or `dones` (N,). Where `terminals` alone tell of ends, episodes are cut after every
+    `terminals`, `timeouts` or `dones` (N,). If only `terminals` tell of ends, episodes are cut after every
     `max_episode_steps`. `success` tells of each episode (E,), NaN of one that is not known, or of each step (N,), and then
     an episode's last one counts. Without rewards a success has a reward of 1 at its last step, and an episode of which
     nothing tells is one.
@@ -156,8 +156,8 @@ def load_flat(
         observations
     :param action_keys: which arrays make up the action, in this order, each (N, ...)
     :param action_bounds: smallest and largest action that the environment accepts, numbers or (A,) each; where they are not
-        given, a file's own `action_low` and `action_high`, or those of `action_space`, or -1 and 1. Of Discrete actions the
-        first and the last one
+        given, a file's own `action_low` and `action_high`, or those of `action_space`, or -1 and 1. For Discrete actions
+        the first and the last one
     :param clip_actions: bring actions outside of them to the nearest bound, however far, instead of refusing them
     :param action_space: the environment's
     :param observation_space: the environment's, which tells what is a choice, see :func:`~sb3_dtfm.data.load_dataset`

@@ -9,7 +9,7 @@ from PIL import Image
 from sb3_dtfm.data.trajectories import DatasetError, wrap_dataset_errors
 from sb3_dtfm.envs.cameras import resize_image
 
-# What is read; others have decoders that few have looked at.
+# Accepted formats; the decoders of others are less reviewed.
 FORMATS = ("JPEG", "PNG")
 # Channels by Pillow's names of what has eight bits each.
 CHANNELS = {"L": 1, "RGB": 3, "RGBA": 4}

@@ -21,10 +21,10 @@ FEW_EPISODES = 20
 BEST_SHARE = 0.1
 # Returns tell the start rather than the quality where the first observation explains this share of their variance.
 START_DECIDES = 0.5
-# Below ten episodes chance explains as much. Of more than 500, which take a tenth of a second, 500 are looked at.
+# Below ten episodes chance explains as much. At most 500 are looked at, which takes a tenth of a second.
 FEWEST_STARTS, MOST_STARTS = 10, 500
-# Of the regression on first observations. Starts are alike within this many standard deviations of each dimension. The noise
-# is a share of the returns' variance; none of both is fitted, so that noise explains less than half of ten returns, too.
+# Regression on first observations: starts are alike within this many standard deviations of each dimension. The noise is
+# a share of the returns' variance; none of both is fitted, so that noise explains less than half of ten returns, too.
 START_WIDTH, START_NOISE = 2.0, 0.3
 
 

@@ -23,7 +23,7 @@ ACTION, REWARDS, SUCCESS, DONE = "action", ("next.reward", "reward"), "next.succ
 OBSERVATION = "observation."
 PIXELS = Number(low=1, whole=True)
 EPISODE_NUMBER = Number(low=0, whole=True)
-# What numbers of a robot are stored as; words are others.
+# Data types of a robot's numbers.
 NUMBERS = (
     "bool",
     *(f"float{n}" for n in (16, 32, 64)),

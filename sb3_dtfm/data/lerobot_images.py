@@ -19,7 +19,7 @@ from sb3_dtfm.envs.return_to_go import CHANNELS
 INFO, DATA, EPISODES = "meta/info.json", "data", "meta/episodes"
 EPISODE, FRAME, TIME = "episode_index", "frame_index", "timestamp"
 IMAGE, VIDEO = "image", "video"
-# Where the videos of formats 2 and 3 are, unless the dataset says otherwise.
+# Default paths of the videos in formats 2 and 3.
 PATHS = {
     "2": "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
     "3": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",

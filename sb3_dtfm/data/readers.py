@@ -36,12 +36,12 @@ from sb3_dtfm.data.zarr_replay import fingerprint_zarr, is_zarr, load_zarr
 Dataset: TypeAlias = (
     str | os.PathLike[str] | MinariDataset | Mapping[str, Any] | Sequence[Any] | ReplayBuffer | TrajectoryBuffer
 )
-# What load_dataset itself does with a dataset of any kind.
+# Options that load_dataset itself applies to a dataset of any kind.
 COMMON_OPTIONS = (
     *("env_id", "env_args", "action_space", "observation_space", "max_episode_steps", "min_return", "best_share"),
     *("success_only", "fraction", "fraction_seed", "allow_pickle"),
 )
-# What some of the options may be, where their readers do not look.
+# Rules for options that readers do not check themselves.
 ACCEPTED: dict[str, Rule] = {
     "clip_actions": BOOLEAN,
     "success_only": BOOLEAN,

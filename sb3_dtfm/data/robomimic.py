@@ -89,7 +89,7 @@ def load_robomimic(
     Rewards are those of :class:`~sb3_dtfm.envs.robosuite.RobosuiteEnv`, whose episode ends at the first success: where a
     file has rewards of 0 and 1 only, an episode is cut after its first 1, so that its return is 1 (robomimic's recordings
     often go on for some steps), and is `terminated`. Any other episode is `truncated` if the file marks its end as done.
-    Where no episode of the file has any reward, or none has been stored, the first step that is done counts as the
+    If no episode of the file has any reward, or none has been stored, the first step that is done counts as the
     success, or the last step if nothing is marked as done. Other rewards (dense ones) are kept as they are; they
     tell of success in robosuite's files, where it is rewarded by 1.
 

@@ -10,8 +10,8 @@ from sb3_dtfm.data.flat import ACTIONS, DONES, OBSERVATIONS, REWARDS, TERMINATIO
 from sb3_dtfm.data.trajectories import DatasetError
 from sb3_dtfm.envs.success import reported_success
 
-# What one step of an episode that was written down step by step holds, in this order. The next observation may be there,
-# too, before the reward or behind it.
+# Parts of a step in an episode that was written down step by step, in order. The next observation may be there, too,
+# before the reward or behind it.
 STEP = ("observation", "action", "reward", "terminated", "truncated")
 SHORT_STEP = ("observation", "action", "reward", "done")
 INFO = ("info", "infos")
@@ -125,7 +125,7 @@ def _next_observation(parts: Sequence[Any]) -> int | None:
     observation, _, third, fourth, fifth = parts[:5]
     if isinstance(observation, Mapping | tuple):
         return next((place for place in (2, 3) if isinstance(parts[place], Mapping | tuple)), None)
-    # Of observations that are numbers, only the types tell a reward and a flag from two flags.
+    # If observations are numbers, only the types tell a reward and a flag from two flags.
     told_apart = _n_axes(observation) > 0 or type(fourth) is not type(fifth)
     if _shape(third) == _shape(observation) and not isinstance(fourth, bool | np.bool_) and told_apart:
         return 2

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from sb3_dtfm.data.trajectories import DatasetError
 
-# Of float32; all others are images, uint8 by the name of their camera.
+# Arrays of float32; all others are uint8 images, named after their camera.
 STEP_ARRAYS = ("observations", "actions", "rewards", "returns_to_go")
 # A build that takes longer than this many seconds shows a progress bar.
 PROGRESS_DELAY = 3.0

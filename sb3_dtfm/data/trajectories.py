@@ -169,7 +169,7 @@ class ReturnReference(NamedTuple):
         The return that a model has to reach, and its name.
 
         A model has to reach its target return. A target beyond every recorded return means the best of the data: then the
-        goal is the best tenth. Where the start decides, a target above the mean is out of reach from most starts: then the
+        goal is the best tenth. If the start decides, a target above the mean is out of reach from most starts: then the
         goal is the mean. The mean is also the goal of a model without a target return, which copies all episodes.
 
         :param target_return: environment reward units; None where the model has none, or does not look at it

@@ -2,7 +2,7 @@
 A saved model: a zip of JSON and safetensors, of which nothing is ever run.
 
 `model.json` names every other member with its size and digest. Members are not compressed, so that none is larger than the
-file. What the numbers mean is the algorithm's business; here they are only brought to the disk and back, unharmed.
+file. The algorithm interprets the numbers; this module only writes them to disk and reads them back, unchanged.
 """
 
 import contextlib

@@ -14,7 +14,7 @@ from torch import nn
 
 from sb3_dtfm.files.replacing import replacing
 
-# Of ONNX's operators: what runtimes of the last years know.
+# Version of ONNX's operators that runtimes of the last years know.
 OPSET = 18
 # The key of the settings among the file's metadata.
 METADATA = "sb3_dtfm"

@@ -18,7 +18,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     A path to write to, which takes the place of `path` at the end if nothing was raised.
 
-    What killed processes left behind in the folder is removed first.
+    Files that killed processes left behind in the folder are removed first.
 
     :param path: the file, there already or not; its folder is made if necessary
     :return: an empty file beside it

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-# Of the classes that settings name, those of these packages and of modules that are imported already are taken.
+# Settings may name classes of these packages and of modules that are imported already.
 PACKAGES = ("gymnasium", "gymnasium_robotics", "rl_zoo3", "sb3_contrib", "sb3_dtfm", "stable_baselines3")
 # Settings that name classes, which RL-Zoo imports and calls, with what those have to be.
 CLASSES = {

@@ -68,9 +68,9 @@ class FinetunedDTFM(SequenceModel):
     A DTFM with a noise policy (noise-space RL) or a residual policy (residual RL) that an online algorithm has learned.
     It acts, is saved, loaded and exported as a DTFM is.
 
-    Of noise `deterministic=True` takes what the algorithm's actor makes of the rows of the model's noise table, which is one
-    draw of the actor's distribution that repeats exactly: at first this is what DTFM itself does, and it stays what the
-    algorithm learns from. The actor's mean would begin at zero noise, where robot arms get stuck. A residual action is the
+    With `deterministic=True` a noise policy's actor maps rows of the model's noise table to noise, which is one draw of the
+    actor's distribution that repeats exactly: at first this is what DTFM itself does, and it stays what the algorithm
+    learns from. The actor's mean would begin at zero noise, where robot arms get stuck. A residual action is the
     actor's mean, whatever `deterministic` is: at first nearly none.
 
     Without an online actor it acts as the DTFM does. It does not learn from data; another actor is learned by

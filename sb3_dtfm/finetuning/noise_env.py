@@ -15,7 +15,7 @@ from sb3_dtfm.policies.context import Context
 
 # Largest noise in a dimension, as in DSRL (Wagenmaker et al., 2025).
 NOISE_BOUND = 1.5
-# Of a model that acts by one, which leaves nothing to choose.
+# Flow steps in place of a mean action, which leaves no noise to choose.
 NOISE_SPACE_FLOW_STEPS = 3
 
 

@@ -65,11 +65,11 @@ class OnlineDTFM(DTFM):
     A DTFM that goes on imitating: its dataset, and those of its own episodes that succeeded.
 
     It acts from fresh noise, so that no two rollouts are alike; successes are imitated, and become more frequent.
-    Where the environment tells of no success, an episode is imitated that returned at least as much as the average of
+    If the environment tells of no success, an episode is imitated that returned at least as much as the average of
     dataset and own episodes so far. With a critic (`critic_steps` among the `policy_kwargs`) all episodes teach the critic,
     failures too, and the critic chooses among `n_action_samples` draws.
 
-    `learn(total_timesteps)` counts the environments' steps, as online algorithms do. What it becomes is a DTFM, and saved as
+    `learn(total_timesteps)` counts the environments' steps, as online algorithms do. The model stays a DTFM and is saved as
     one: `OnlineDTFM.load("can.zip", env, dataset="can.hdf5")` goes on from a DTFM, and `DTFM.load` reads what it saves.
 
     :param n_episodes: own episodes between two times of learning, of all environments together

@@ -14,7 +14,7 @@ from sb3_dtfm.finetuning.online_actor import check_residual_actions
 from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.policies.context import Context
 
-# Of actions between -1 and 1.
+# Largest residual action by default, in units of [-1, 1].
 RESIDUAL_BOUND = 0.5
 
 

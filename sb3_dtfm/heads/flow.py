@@ -18,7 +18,7 @@ from sb3_dtfm.networks.solvers import SOLVERS, integrate, solver_times
 
 # Not an ODE solver: a network of its own that has learnt where the solver would end.
 ONE_STEP = "one_step"
-# Of a solver of more steps, the network learns where so many end.
+# Most Euler steps whose end the one-step policy learns, however many the solver takes.
 MAX_DISTILLED_STEPS = 16
 # Values of tau in a window, which its steps take in turn: the share of tau in scales and shifts is computed once for each.
 TAUS_PER_WINDOW = 4
@@ -95,7 +95,7 @@ class FlowHead(ActionHead):
     By the flow's loss alone the Transformer learns the mean more slowly.
 
     With `one_step_policy` a second network learns where `flow_steps` of Euler end, 16 at most, so that an action can take
-    one evaluation instead of one per solver step. It passes no gradient back. Where the field predicts actions, it adds
+    one evaluation instead of one per solver step. It passes no gradient back. If the field predicts actions, it adds
     to the same W h + b, and starts at zero, too; else it adds to the noise.
 
     :param embed_dim: D

@@ -9,7 +9,7 @@ import torch as th
 from torch import nn
 from torch.optim.adamw import adamw
 
-# What AdamW keeps of each parameter, by torch's names.
+# State of AdamW for each parameter, by torch's names.
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 # Bytes, of torch's own memory on a CPU.
 ALIGNMENT = 64
@@ -20,7 +20,7 @@ class FlatTensors:
     Tensors that are views of one, so that one call does for all of them what would take a call each.
 
     Each begins where torch would have it begin, at a multiple of 64 bytes: what is computed with it depends on that in the
-    last digit. What lies between them is zero. Whoever replaces their memory, as moving a network to another device does,
+    last digit. The numbers between them are zero. Whoever replaces their memory, as moving a network to another device does,
     has them laid out again at the next use.
 
     :param tensors: of the same dtype, in the order in which they are laid out
@@ -60,7 +60,7 @@ class FlatAdamW(th.optim.AdamW):
     """
     AdamW (Loshchilov and Hutter, 2019) over one tensor that all parameters and one that all moments are views of.
 
-    What a state dict holds is what torch's AdamW writes.
+    A state dict has the layout of torch's AdamW.
 
     :param decayed: parameters with weight decay
     :param spared: parameters without
@@ -75,7 +75,7 @@ class FlatAdamW(th.optim.AdamW):
     load_state_dict = inspect.unwrap(th.optim.Optimizer.load_state_dict)
     _drop_gradients = inspect.unwrap(th.optim.Optimizer.zero_grad)
 
-    # Of a gradient step that changes nothing 1, else 0; a GPU decides by it without a host that waits.
+    # 1 for a gradient step that changes nothing, else 0; a GPU decides by it without a host that waits.
     found_inf: th.Tensor | None = None
 
     def __init__(
@@ -89,7 +89,7 @@ class FlatAdamW(th.optim.AdamW):
         groups = [{"params": decayed, "weight_decay": weight_decay}, {"params": spared, "weight_decay": 0.0}]
         super().__init__(groups, lr=lr, fused=True)
         apart = {id(parameter) for parameter in unclipped}
-        # What is clipped lies in the middle, in one piece.
+        # Clipped parameters lie in the middle, in one piece.
         decayed = sorted(decayed, key=lambda parameter: id(parameter) not in apart)
         spared = sorted(spared, key=lambda parameter: id(parameter) in apart)
         self.parameters = [*decayed, *spared]

@@ -156,7 +156,7 @@ def _empty_rows(context: Context, rows: np.ndarray) -> Context:
     """
     emptied = {}
     for name, array in context._asdict().items():
-        # What is kept is large, and behind the mask any finite number in it is as good as zero.
+        # Keys and values are large, and behind the mask any finite number in them is as good as zero.
         if name != "keys_values" or not np.isfinite(array[rows]).all():
             emptied[name] = array.copy()
             emptied[name][rows] = 0

@@ -30,7 +30,7 @@ class Critic(nn.Module):
     was not recorded.
 
     V(s) is an expectile of Q(s, a) over the data's actions, above their mean: what a good one of them leads to. Q(s, a) is
-    the reward and the discounted V of the next observation. Of two Qs the smaller one counts.
+    the reward and the discounted V of the next observation. The smaller of two Qs counts.
 
     :param observation_dim: O
     :param action_dim: h A, of all actions that are valued together
@@ -74,7 +74,7 @@ class Critic(nn.Module):
     def gains(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
         Return how much more than the first of N actions each is worth, by the Q that finds less: another one is worth more
-        only where both Qs say so. What they misjudge alike in all actions of an observation is no part of it.
+        only where both Qs say so. An error that a Q makes alike in all actions of an observation cancels out.
 
         :param observations: (B, O), normalised
         :param actions: (B, N, h A) in [-1, 1]

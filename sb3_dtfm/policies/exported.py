@@ -22,8 +22,8 @@ class ExportedPolicy(nn.Module):
     Whoever calls it keeps the windows: shifts them by a step, puts in the newest one, and when the action is carried out
     that, too. A row begins anew when its mask is cleared; what is behind the mask may be any finite number.
 
-    Actions of a Discrete space are vectors here: 1 for the choice, 0 for the others. Of images the newest ones go in, and
-    features of earlier ones are state in and state out.
+    Actions of a Discrete space are vectors here: 1 for the choice, 0 for the others. The newest images are inputs;
+    features of earlier images are state in and state out.
 
     :param policy: stays as it is; what acts of it is copied to the CPU
     :raises ValueError: its critic would choose among several draws

@@ -63,8 +63,8 @@ def record_agent(
     Gaussian noise stay the same, but the agent's own sampling and the rounding of its network do not.
 
     The agent sees what it was trained on: an RL-Zoo run brings its environment arguments, wrappers and VecNormalize
-    statistics (see :func:`~sb3_dtfm.recording.loading.find_agent`). What is recorded is what the environment itself gave
-    and was given, neither wrapped nor normalised.
+    statistics (see :func:`~sb3_dtfm.recording.loading.find_agent`). The recording holds the environment's own observations,
+    actions and rewards, neither wrapped nor normalised.
 
     The metadata's `ref_min_score` is the mean return of random actions, `ref_max_score` that of the recorded episodes.
 

@@ -130,7 +130,7 @@ def add_noise(
     act: ActFunction, space: ActionSpace, noise: float, generator: Callable[[int], np.random.Generator]
 ) -> ActFunction:
     """
-    The same actions with Gaussian noise, clipped into the action space. Of a Discrete space they stay as they are.
+    The same actions with Gaussian noise, clipped into the action space. Discrete actions stay as they are.
 
     :param act: chooses the actions
     :param space: the action space

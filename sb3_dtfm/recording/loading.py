@@ -135,7 +135,7 @@ def load_agent(algo: str, model: str | Path, device: str) -> BaseAlgorithm:
     """
     Load an agent to act with.
 
-    What only training needs is left behind: schedules, which may have been pickled by another Python, and the replay buffer.
+    Schedules, which may have been pickled by another Python, and the replay buffer are not loaded: only training needs them.
 
     :param algo: class name in any case, or RL-Zoo's name for it
     :param model: zip file
@@ -240,8 +240,8 @@ def _check_not_normalized(model: BaseAlgorithm, path: Path) -> None:
     """
     Refuse an agent that was trained with VecNormalize, whose statistics are missing.
 
-    The agent's file holds its last observation, and the one before normalisation, which turns float64 into float32. Where
-    the environment's are float32 already, having the latter means VecNormalize, except for off-policy algorithms, which
+    The agent's file holds its last observation, and the one before normalisation, which turns float64 into float32. If the
+    environment's are float32 already, having the latter means VecNormalize, except for off-policy algorithms, which
     always have it: then this is unknown, and there is a warning.
     """
     seen, original = _dtypes(model._last_obs), _dtypes(model._last_original_obs)

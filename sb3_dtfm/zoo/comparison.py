@@ -96,7 +96,7 @@ def compare(
     """
     Compare a model's episodes with its target return and the recorded episodes, see :meth:`ReturnReference.goal`.
 
-    Where they reach less than nine tenths of the goal, suggestions follow: longer training, and a sweep where the model
+    If they reach less than nine tenths of the goal, suggestions follow: longer training, and a sweep where the model
     looks at a target return.
 
     :param attributes: of the model, or of its file; `target_return` is that of these episodes

@@ -27,7 +27,7 @@ from sb3_dtfm.zoo.arguments import UsageError, with_target_return
 from sb3_dtfm.zoo.manager import OF_RL_ZOO, OfflineExperimentManager
 from sb3_dtfm.zoo.resuming import EPISODES, StopSignals
 
-# What an algorithm may learn in, by the key of its settings in a run's config.yml, where `enjoy` must not find a wrapper.
+# Environments to learn in, by the key of their settings in a run's config.yml, where `enjoy` must not find a wrapper.
 FROZEN_ENVS = {"noise_env": NoiseActionVecEnv, "residual_env": ResidualActionVecEnv}
 # The online algorithm itself, as Stable-Baselines3 saves it.
 AGENT = "agent"

@@ -64,9 +64,9 @@ class OfflineExperimentManager(ExperimentManager):
     - A run that ends before it has a model leaves no folder, where `enjoy` would look for the latest run.
     - An environment of dt or dtfm always shows a return-to-go, and the run's settings hold its target return.
     - dt and dtfm are evaluated before the first gradient step and after the last one too.
-    - Of the processes of one training, the first alone runs callbacks.
-    - They keep a checkpoint while they train, and a run goes on from it.
-    - What the last evaluation reached is compared with what was recorded.
+    - Only the first process of a training runs callbacks.
+    - dt and dtfm keep a checkpoint while they train, and a run goes on from it.
+    - The last evaluation is compared with the recorded episodes.
 
     :param arguments: what the command was called with
     :param resumed: folder of a run to go on with, instead of a new one

@@ -96,7 +96,7 @@ class StopSignals:
     Ctrl-C and SIGTERM end training between two gradient steps, or an evaluation: what is saved is a state that training can
     go on from.
 
-    The second one interrupts at once. Where several processes train together, signals do what they did.
+    The second one interrupts at once. Several processes that train together leave the signals' handlers alone.
 
     :param between_steps: False where `asked` is not read between steps: the first one interrupts at once, too
     """
@@ -295,7 +295,7 @@ def go_on(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], start: Start)
         for output in logger.output_formats:
             if isinstance(output, TensorBoardOutputFormat):
                 output.writer.close()
-                # What the interrupted run had logged behind its checkpoint is then left out.
+                # Entries that the interrupted run logged after its checkpoint are then left out.
                 output.writer = SummaryWriter(start.tensorboard, purge_step=n_steps + 1 if n_steps else 0)
         model.set_logger(logger)
 

@@ -137,7 +137,7 @@ class BaselineProcess:
         deterministic: bool = True,
     ) -> tuple[np.ndarray, None]:
         """
-        Actions (n_envs, A), as an SB3 model's `predict` has them. What a baseline remembers of an episode stays with it.
+        Actions (n_envs, A), as an SB3 model's `predict` has them. A baseline's process keeps its memory of an episode.
 
         :param observation: of `ReturnToGoWrapper`, (n_envs, .) each
         :param state: none

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO, NamedTuple, Protocol
 import numpy as np
 
 PROGRESS_INTERVAL = 0.5  # seconds
-# What a baseline's speed is measured by before its training is planned.
+# Trial of a baseline's speed before its training is planned: longest seconds and steps, and first steps that do not count.
 TRIAL_SECONDS, TRIAL_STEPS, FIRST_STEPS = 10.0, 500, 10
 TIMED_ACTIONS = 16
 

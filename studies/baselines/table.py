@@ -21,7 +21,7 @@ from sb3_dtfm.benchmark.report.statistics import student_t
 
 NONE = "-"
 Grouped = dict[tuple[str, str], list[Run]]  # by dataset and algorithm
-# What studies/suite.yml calls a dataset of studies/baselines.yml, where it has another name there.
+# Names in studies/suite.yml of datasets that have another one in studies/baselines.yml.
 IN_SUITE = {"can-few": "can-10", "walker2d-clean": "walker2d-expert", "pusht-human": "pusht"}
 
 

@@ -56,7 +56,7 @@ REFUSED_OF_THE_FLOW = {
     "regression_coef": (-1, NAN),
     "one_step_policy": ("no", 0),
 }
-# Where a value is one of a few words, the refusal lists them.
+# Options that take one of a few words, which the refusal lists.
 CHOICES = {
     "precision": ("auto", "float32", "bfloat16"),
     "learning_rate_schedule": ("constant", "linear", "cosine"),
@@ -135,7 +135,7 @@ def test_an_argument_of_the_flow_out_of_range_is_refused(name, value, cheetah_bu
 
 @pytest.mark.parametrize(("algorithm", "name"), [(DT, "embed_dims"), (DTFM, "flow_hidden"), (DT, "flow_hidden_dim")])
 def test_an_unknown_argument_of_the_policy_is_refused_with_those_accepted(algorithm, name, cheetah_buffer):
-    """What only DTFM knows is unknown to DT."""
+    """An option of DTFM alone is unknown to DT."""
     with pytest.raises(ValueError, match=rf"policy_kwargs.*\b{name}\b") as refusal:
         make_model(algorithm, cheetah_buffer, policy_kwargs={name: 64})
     assert ("embed_dims (did you mean embed_dim?) is unknown" in str(refusal.value)) == (name == "embed_dims")

@@ -1,4 +1,4 @@
-"""What is evaluated, when, and what the log says of it."""
+"""Callbacks: what they evaluate, when, and what they log."""
 
 import re
 

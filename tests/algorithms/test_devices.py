@@ -1,4 +1,4 @@
-"""What a GPU would have to wait for, and for whom, seen without one."""
+"""Waits between a GPU and its host, found without a GPU."""
 
 import time
 

@@ -49,7 +49,7 @@ def test_a_model_that_diverged_can_go_on_more_slowly(cheetah_buffer, tmp_path):
 
 
 def test_the_end_of_learning_looks_once_more(cheetah_buffer, monkeypatch):
-    """Where a GPU computes the loss, nobody has looked at it before if nothing was logged."""
+    """A GPU's loss has not been checked before if nothing was logged."""
     monkeypatch.setattr(RunningMeans, "sums", lambda means: {"loss": float("nan"), "grad_norm": 1.0})
     with pytest.raises(FloatingPointError, match="loss became nan"):
         make_model(DT, cheetah_buffer).learn(1, log_interval=None)

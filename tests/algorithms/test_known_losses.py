@@ -16,7 +16,7 @@ HEADS = {
     DT: {},
     DTFM: dict(flow_hidden_dim=256, flow_prediction="action", flow_tau_exponent=2.0, flow_steps=1, regression_coef=0.0),
 }
-# Of every sixth of 30 gradient steps, and the acting policy's action_mse after them.
+# Losses of every sixth of 30 gradient steps, and the acting policy's action_mse after them.
 KNOWN = {
     DT: ([0.54332978, 0.36880848, 0.35068056, 0.34039873, 0.33506033], 0.32348481),
     DTFM: ([0.51563275, 0.40093032, 0.35162923, 0.32001892, 0.29018167], 0.32107106),

@@ -1,4 +1,4 @@
-"""What does not fit into memory is an error that says what to lower."""
+"""A lack of memory raises an error that says what to lower."""
 
 import numpy as np
 import pytest

@@ -36,7 +36,7 @@ class Interrupt(BaseCallback):
 
 
 def curves_of(model, n_steps, **kwargs):
-    """What is logged, but for the time."""
+    """All logged values, but for the time."""
     curves = record_curves(model)
     model.learn(n_steps, log_interval=5, **kwargs)
     return {name: points for name, points in curves.points.items() if not name.startswith("time/")}

@@ -1,4 +1,4 @@
-"""What README says of the committed results is what the report makes of them."""
+"""README quotes the committed results as the report computes them."""
 
 from collections import defaultdict
 from pathlib import Path

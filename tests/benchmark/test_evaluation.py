@@ -127,7 +127,7 @@ def test_an_action_is_timed_in_one_environment_and_on_the_average():
 
 @pytest.fixture
 def row() -> dict[str, Any]:
-    """What all rows of a run say: HalfCheetah in episodes of 5 steps."""
+    """Fields that all rows of a run share: HalfCheetah in episodes of 5 steps."""
     wrapper = {"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 5.0}}
     settings = {"env_wrapper": [wrapper], "env_kwargs": {"max_episode_steps": 5}}
     return {**RunKey("HalfCheetah-v5", 1.0, "dtfm", 3, "tiny")._asdict(), "settings": settings, "data": {}}

@@ -83,7 +83,7 @@ def test_a_killed_grid_takes_its_run_along_goes_on_and_repeats_nothing(grid, wor
     assert not list(logs.glob("*/rows.jsonl"))
     (first,) = results.glob("*.jsonl")
     content, written = first.read_bytes(), first.stat().st_mtime_ns
-    # What a run that was killed halfway leaves behind
+    # Rows as a run that was killed halfway leaves them behind
     broken = logs / "attempt-old"
     broken.mkdir()
     (broken / "rows.jsonl").write_text(content.decode().splitlines()[0] + "\n")
@@ -163,7 +163,7 @@ def test_a_run_that_fails_leaves_a_log_and_the_grid_goes_on(instead, says, grid,
     assert f"{log.relative_to(workplace)}: {says}" in output
     assert [path.name for path in (workplace / "results").glob("*.jsonl")] == [f"{TASK}_1_dt_seed0_tiny.jsonl"]
 
-    # What was put into a study's folder meanwhile is finished, too
+    # A run that was moved into a study's folder meanwhile is finished, too
     (workplace / "results" / "study").mkdir()
     finished = workplace / "results" / f"{TASK}_1_dt_seed0_tiny.jsonl"
     finished.rename(workplace / "results" / "study" / "rows.jsonl")

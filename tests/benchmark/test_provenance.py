@@ -1,4 +1,4 @@
-"""Where rows come from."""
+"""Provenance of rows: commit, versions, hardware and data."""
 
 import json
 import re

@@ -50,7 +50,7 @@ def test_labels_are_told_apart_and_unfinished_runs_left_out():
 
 def test_late_best_and_final_are_those_of_each_run(groups):
     runs = groups["small"].of(LIFT, 1.0, "dt")
-    # Of four episodes each: 0 1 2 3 2 2 and 0 2 2 2 4 2 succeed, then 3 at the end.
+    # With four episodes each, 0 1 2 3 2 2 and 0 2 2 2 4 2 succeed, then 3 at the end.
     assert [run.value("late") for run in runs] == [50.0, 60.0]
     assert [run.value("best") for run in runs] == [75.0, 100.0]
     assert [run.value("final") for run in runs] == [75.0, 75.0]

@@ -63,12 +63,12 @@ def test_the_deviation_is_the_samples():
 
 def test_interquartile_mean_leaves_out_both_ends_of_all_combinations_together():
     assert interquartile_mean([np.array([1000.0, 1.0]), np.array([3.0, -1000.0])]) == 2.0
-    # Of seven values a quarter, rounded down, is one at each end
+    # A quarter of seven values, rounded down, is one at each end
     assert interquartile_mean([np.array([9.0, 1.0, 2.0]), np.array([3.0, 4.0, -9.0, 5.0])]) == 3.0
 
 
 def test_probability_of_improvement_by_hand():
-    # Of 4 pairs, 2 > 1 and 2 > 0 win, 0 against 0 is a tie, and 0 against 1 is lost
+    # Among 4 pairs 2 > 1 and 2 > 0 win, 0 against 0 is a tie, and 0 against 1 is lost
     assert probability_of_improvement([np.array([2.0, 0.0])], [np.array([1.0, 0.0])]) == 2.5 / 4
     # Tasks count alike, whatever their numbers of runs
     scores, others = [np.array([1.0]), np.array([0.0, 0.0, 0.0])], [np.array([0.0]), np.array([1.0])]
@@ -83,7 +83,7 @@ def test_probability_of_improvement_is_mann_whitneys():
 
 
 def test_the_bootstrap_draws_tasks_as_well_as_runs():
-    # Runs of a task are equal, so that all there is to draw are tasks. Of two, both draws are the first, the second or one
+    # Runs of a task are equal, so that all there is to draw are tasks. With two, both draws are the first, the second or one
     # each: means 0 and 1 with probability 1/4 each, so that they are the limits.
     scores = [np.zeros(3), np.ones(3)]
     assert bootstrap(overall_mean, ["a", "b"], scores) == (0.5, 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""What is drawn on the command line."""
+"""Figures that the command line draws."""
 
 import pytest
 from matplotlib.figure import Figure

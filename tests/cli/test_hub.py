@@ -1,4 +1,4 @@
-"""What is pushed and pulled, through a folder instead of the hub."""
+"""Pushing and pulling models, through a folder instead of the hub."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""What is in a dataset: real recordings, and arrays of which every fault is known."""
+"""Inspection of datasets: real recordings, and arrays of which every fault is known."""
 
 import shlex
 from pathlib import Path

@@ -47,7 +47,7 @@ def trained(workplace, monkeypatch) -> Path:
 
 
 def frames(path: Path) -> list[np.ndarray]:
-    """Of a GIF."""
+    """Frames of a GIF."""
     with Image.open(path) as image:
         pictures = []
         for i in range(image.n_frames):

@@ -26,7 +26,7 @@ N_STEPS, N_OBSERVATIONS, N_ACTIONS = sum(LENGTHS), 3, 2
 MINARI_ID = "corpus/set-v0"
 DATA_FOLDER = Path("datasets") / MINARI_ID / "data"
 LEROBOT_INFO, LEROBOT_DATA = Path("meta/info.json"), Path("data/chunk-000/file-000.parquet")
-# What should come of a dataset whose numbers are the good one's, and of one that is read though its numbers are others.
+# Results of reading: the good dataset's numbers, or other numbers.
 SAME, READ = "same", "read"
 SPARSE = 10**12  # rows
 
@@ -149,7 +149,7 @@ def records(array: np.ndarray) -> np.ndarray:
     return np.array([(1.0, 2.0)] * len(array), dtype=[("x", "f8"), ("y", "f8")])
 
 
-# What becomes of an array, and what should become of the dataset: refused if nothing is said.
+# Changes to an array, and the expected result of reading the dataset; None expects a refusal.
 CHANGED: dict[str, tuple[Callable[[np.ndarray], Any], str | None]] = {
     "float16": (lambda a: a.astype(np.float16), READ),
     "float32": (lambda a: a.astype(np.float32), READ),
@@ -239,7 +239,7 @@ def unwritten(file: h5py.File, path: str, folder: Path) -> None:
 
 
 def pipe(folder: Path) -> str:
-    """What nobody writes to, so that whoever opens it waits for ever."""
+    """A pipe that nobody writes to, so that whoever opens it waits for ever."""
     os.mkfifo(folder / "pipe")
     return str(folder / "pipe")
 
@@ -251,7 +251,7 @@ def link_through_pipe(file: h5py.File, path: str, folder: Path) -> None:
 
 
 def virtual_over_pipe(file: h5py.File, path: str, folder: Path) -> None:
-    """Of as many rows as the other file has."""
+    """Make the array a virtual one with as many rows as the pipe's file has."""
     array = file[path][()]
     del file[path]
     shapes = dict(shape=array.shape, maxshape=(None, *array.shape[1:]))
@@ -342,7 +342,7 @@ def of_array(make: Callable[[np.ndarray], Any]) -> Callable[[h5py.File, str, Pat
 
 
 MINARI_FIELDS = ("observations", "actions", "rewards", "terminations", "truncations")
-# Where the rule of a row above is not that of a field: what is stored is optional, or its shape may be another.
+# Fields with another result than their row above: they are optional, or their shape may be another.
 EXCEPTIONS: dict[tuple[str, str, str], str | None] = {
     ("hdf5", "observations", "row less"): SAME,  # the last one is not needed
     ("hdf5", "terminations", "column more"): None,

@@ -21,7 +21,7 @@ def test_return_to_go_restarts_with_each_episode():
 
 
 def naive_window(trajectory: Trajectory, end: int, context_length: int) -> dict[str, np.ndarray]:
-    """What a window must hold, step by step."""
+    """The expected window, built step by step."""
     window = {
         "observations": np.zeros((context_length, 3), np.float32),
         "actions": np.zeros((context_length, 2), np.float32),

@@ -301,7 +301,7 @@ def test_a_large_file_is_checked_in_the_background_and_told_of_by_the_batch_afte
 def test_a_build_that_is_killed_anywhere_leaves_nothing_that_disturbs_the_next_one(
     killed_at: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Of the renames, removals and files that take an outdated cache's place, it ends before each in turn."""
+    """It ends in turn before each rename, removal and write that replaces an outdated cache."""
     fingerprints = [Fingerprint("set", "", "", state) for state in ("old", "new")]
     load_cached(tmp_path, fingerprints[0], fill([4]))
     count = itertools.count()

@@ -1,4 +1,4 @@
-"""What the data decide: plans or answers, returns that differ or not, few steps or many."""
+"""Decisions by the data: plans or answers, returns that differ or not, few steps or many."""
 
 import numpy as np
 import pytest

@@ -77,7 +77,7 @@ def test_some_of_the_episodes_are_learned_from_alone(buffer):
 
 
 def test_the_rewards_of_n_to_2_n_steps_count_as_they_came(buffer, monkeypatch):
-    """Where nothing is expected, the mean of these sums is left: of ones, 2 and 3 and 4, or as many as are left."""
+    """If zero is expected, the mean of these sums is left: of 2, 3 and 4 rewards of one, or as many as are left."""
     monkeypatch.setattr(expected, "_regression", lambda steps, statistics, seed: th.zeros(len(steps.rows)))
     found = by_episode(buffer.with_expected_returns(2, seed=0))
     np.testing.assert_allclose(found[0], [3.0, 3.0, 2.5, 2.0, 2.0, 1.0])

@@ -31,7 +31,7 @@ FILES = {
 }
 MOST_SECONDS, MOST_BYTES = 5, 2**29
 BOUNDED = settings(derandomize=True, deadline=None, max_examples=40, database=None, suppress_health_check=list(HealthCheck))
-# Where, as a share of the file, and what: bytes that take the place of others, or nothing for the rest being cut off.
+# Place as a share of the file, and bytes that take the place of others; no bytes cut off the rest.
 damages = st.lists(
     st.tuples(st.floats(0, 1, exclude_max=True), st.one_of(st.binary(max_size=1), st.binary(min_size=1, max_size=8))),
     min_size=1,
@@ -65,7 +65,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def read_or_refuse(folder: Path, kind: str) -> None:
-    """What is read is whole: as many steps as the episodes have, all of them finite."""
+    """Read a whole dataset (as many steps as its episodes have, all finite), or have it refused."""
     options = {"observation_keys": ["state"]} if kind == "robomimic" else {}
     paths = {kind: FILES[kind] for kind in ("npz", "flat", "robomimic", "csv", "table")}
     paths |= dict.fromkeys(("lerobot", "lerobot, told"), "arm")

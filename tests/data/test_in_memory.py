@@ -1,4 +1,4 @@
-"""What is already in memory: lists of episodes and SB3's replay buffers."""
+"""Data in memory: lists of episodes and SB3's replay buffers."""
 
 import itertools
 from collections import namedtuple

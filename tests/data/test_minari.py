@@ -304,7 +304,7 @@ PICTURES = spaces.Dict(
 
 
 def pictures(n_steps: int) -> dict[str, np.ndarray]:
-    """What a camera sees is smooth, so that JPEG changes it little; rows and columns tell which way up it is."""
+    """Smooth images, so that JPEG changes them little; rows and columns tell which way up they are."""
     rows, columns = np.mgrid[:40, :48]
     hand = np.stack([np.stack([5 * rows, 5 * columns, np.full_like(rows, 9 * step)], axis=2) for step in range(n_steps + 1)])
     seen = {"hand": hand.astype(np.uint8), "first": np.moveaxis(hand, 3, 1).astype(np.uint8)}

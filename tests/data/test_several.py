@@ -91,7 +91,7 @@ def test_precision_is_no_other_range_of_actions(tmp_path):
 
 
 def test_the_best_of_each_are_chosen_by_what_lies_within_the_time_limit():
-    """Of each first dataset the last episode returns most, behind its third step."""
+    """The last episode of each dataset returns most, but only behind its third step."""
     with pytest.warns(UserWarning, match="1 of 3 episodes have more than 3 steps"):
         buffer = load_dataset([{"dataset": arrays(5.0), "min_return": 1.0}, {"dataset": arrays(0.0)}], max_episode_steps=3)
     assert buffer.episode_lengths.tolist() == [2, 3, 2, 3, 3]

@@ -1,4 +1,4 @@
-"""Of episodes longer than the environment's time limit the first steps are learned from, and asked for by their returns."""
+"""Episodes longer than the environment's time limit count with their first steps and the returns of these."""
 
 import warnings
 

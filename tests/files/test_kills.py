@@ -131,7 +131,7 @@ def test_a_killed_cache_is_built_again(workplace):
 
 
 def test_a_file_is_whole_or_as_before(tmp_path):
-    """What is written beside takes its place at the end, and only where nothing was raised."""
+    """The file written beside takes its place at the end, and only if nothing was raised."""
 
     def write(value: int, fail: bool = False) -> None:
         with replacing(path) as beside, h5py.File(beside, "w") as file:
@@ -165,7 +165,7 @@ def test_leftovers_of_killed_processes_alone_are_removed(tmp_path):
 
 
 def on_a_full_disk(size: int, work: Callable[[], object]) -> str:
-    """What work raises that may write files of this many bytes, and no longer ones."""
+    """Error of work that may write no file of more than `size` bytes."""
 
     def limited() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
@@ -175,7 +175,7 @@ def on_a_full_disk(size: int, work: Callable[[], object]) -> str:
 
 
 def said_by(work: Callable[[], object]) -> str:
-    """What work raises in a process of its own."""
+    """Error of work in a process of its own."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:

@@ -31,7 +31,7 @@ RAN = []
 
 
 def ran():
-    """What a pickle would run."""
+    """Code that a pickle would run."""
     RAN.append(True)
 
 
@@ -81,7 +81,7 @@ def forged(content: bytes, change, tensors=None, group="policy") -> bytes:
 
 
 def refused(content: bytes, tmp_path: Path) -> str:
-    """What a user reads; soon, and without more memory than some times the file's."""
+    """Error that a user reads; soon, and without more memory than some times the file's."""
     path = tmp_path / "model.zip"
     path.write_bytes(content)
     tracemalloc.start()

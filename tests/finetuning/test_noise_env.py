@@ -62,7 +62,7 @@ def model(request, cheetah_buffer):
 
 
 def table_noise(policy, context) -> np.ndarray:
-    """What `deterministic=True` starts from at a context's newest step."""
+    """Noise of `deterministic=True` at a context's newest step."""
     return policy._acting_noise(context.timesteps[:, -1] + context.episode_keys, True).numpy()
 
 

@@ -104,7 +104,7 @@ def test_so_many_steps_are_of_own_episodes_that_succeeded(model, successes, wort
     """
     A quarter of what is imitated is own.
 
-    Where nobody tells of success, an episode counts that is above the average: of the last two the second one.
+    If nothing tells of success, an episode above the average counts: the second of the last two.
     """
     model.set_dataset(episodes([0.0] * 6, [None] * 6, first=0.0))
     model._training_seed = 0

@@ -1,4 +1,4 @@
-"""What only makes a CPU faster, against torch's own way."""
+"""CPU optimisations give the results of torch's own functions."""
 
 import numpy as np
 import pytest

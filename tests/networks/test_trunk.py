@@ -187,7 +187,7 @@ def test_kept_keys_and_values_are_attention_with_a_band_once_the_window_slides(t
 
 
 def test_a_single_token_attends_to_itself():
-    """What the shortcut leaves out changes neither the hidden state nor a gradient."""
+    """The shortcut for one token changes neither the hidden state nor a gradient."""
     block = TransformerBlock(8, 2, 0.0)
     tokens, bias = th.randn(4, 1, 8), th.zeros(4, 2, 1, 1)
     short = block(tokens, None)

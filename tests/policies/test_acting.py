@@ -371,7 +371,7 @@ def test_a_clipped_return_to_go_stays_within_the_data(algorithm, policy_kwargs, 
     assert (low < high).all()
 
     def actions(*returns_to_go):
-        """What is done in the first steps of an episode with this return-to-go at each."""
+        """Actions in the first steps of an episode with these returns-to-go."""
         state, found = None, []
         for t, return_to_go in enumerate(returns_to_go):
             observation = dict(observation=np.full(17, 0.1), return_to_go=np.array([return_to_go]), timestep=np.array([t]))

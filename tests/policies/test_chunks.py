@@ -18,7 +18,7 @@ def model(request, cheetah_buffer):
 
 
 def observations(n_steps, n_rows, seed=0):
-    """Of so many environments, (n_rows, ...) at each step."""
+    """Observations of `n_rows` environments, (n_rows, ...) at each step."""
     rng = np.random.default_rng(seed)
     for t in range(n_steps):
         yield {

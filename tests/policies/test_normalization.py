@@ -1,4 +1,4 @@
-"""What becomes of observations and returns-to-go on their way into the network, by hand."""
+"""Normalisation of observations and returns-to-go for the network, by hand."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Whose context is it? Of whoever passes `state`; what the policy remembers is one caller's, who passes nothing."""
+"""Context with and without `state`: without it the policy remembers the steps of one caller."""
 
 import warnings
 
@@ -40,7 +40,7 @@ def act(model, observation, **kwargs):
 
 
 def act_alone(model, observations) -> np.ndarray:
-    """What a caller does who carries a state of their own from the first observation to the last."""
+    """Actions for a caller who passes a state of their own from the first observation to the last."""
     actions, state, episode_start = [], None, np.array([True])
     for observation in observations:
         action, state = model.predict(observation, state, episode_start, deterministic=True)

@@ -17,7 +17,7 @@ def model(request, cheetah_buffer):
 
 
 def observe(t: int, n_rows: int = N_ROWS) -> dict[str, np.ndarray]:
-    """What so many environments show at a time step."""
+    """Observations of `n_rows` environments at a time step."""
     return {
         "observation": np.random.default_rng(t).normal(size=(n_rows, 17)).astype(np.float32),
         "return_to_go": np.full((n_rows, 1), 5.0 - t, np.float32),

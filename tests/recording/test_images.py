@@ -87,7 +87,7 @@ def test_any_image_comes_back_as_it_was(space):
 
 
 def replay(env):
-    """What an environment shows before each recorded action."""
+    """The environment's observation before each recorded action."""
     dataset = minari.load_dataset(ID)
     for episode, metadata in zip(dataset, dataset.storage.get_episode_metadata(dataset.episode_indices), strict=True):
         observation, _ = env.reset(seed=metadata["seed"])

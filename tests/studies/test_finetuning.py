@@ -1,4 +1,4 @@
-"""What fine-tuning brought is measured and shown."""
+"""Measurements and figures of the fine-tuning study."""
 
 import shutil
 

@@ -117,7 +117,7 @@ for task in ("cube-single", "scene", "puzzle-3x3", "cube-double"):
 @pytest.mark.slow
 @pytest.mark.skipif(not PYTHON.exists(), reason="make ogbench installs it")
 def test_transitions_are_those_of_ogbench_s_own_reader(tmp_path):
-    """Of an episode whose cube stays at the goal of task 1 for a while."""
+    """The cube of an episode stays at the goal of task 1 for a while."""
     code = """
 import sys
 import gymnasium as gym

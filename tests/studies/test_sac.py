@@ -14,7 +14,7 @@ from sb3_dtfm.data import Trajectory, TrajectoryBuffer
 
 
 def test_recorded_steps_lie_in_the_replay_buffer():
-    """Of episodes of four and three steps, the second one truncated: its last step has no next observation."""
+    """An episode of four steps ends, one of three is truncated, so that its last step has no next observation."""
     envs = make_vec_env("MountainCarContinuous-v0", 2)
     agent = SAC("MlpPolicy", envs, buffer_size=100)
     observations = np.arange(14, dtype=np.float32).reshape(7, 2)

@@ -1,4 +1,4 @@
-"""What the command line makes of its arguments before RL-Zoo sees them."""
+"""Arguments of the command line before RL-Zoo sees them."""
 
 import argparse
 import ast

@@ -12,7 +12,7 @@ ENV = EnvironmentName("robosuite/Lift-v0")
 
 @pytest.fixture
 def runs(tmp_path) -> Path:
-    """Of five runs the second, the tenth and one of another task have a model, the second its best one too."""
+    """Six runs: the second, the tenth and one of another task have a model, the second its best one, too."""
     for number in (1, 2, 9, 10, 11):
         (tmp_path / "dt" / f"{ENV}_{number}").mkdir(parents=True)
     other = tmp_path / "dt" / f"{ENV}_easy_20"

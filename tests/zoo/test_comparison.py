@@ -1,4 +1,4 @@
-"""What `train` and `enjoy` say of a model beside what it learned from."""
+"""Comparison of a model with its data, as `train` and `enjoy` print it."""
 
 from types import SimpleNamespace
 

@@ -192,7 +192,7 @@ def test_a_damaged_start_is_named(start, planted, capsys):
     assert "start.json is damaged" in capsys.readouterr().err
 
 
-# What SECURITY.md lists, by command: the user's own arguments, and pickles.
+# Code that still runs, as SECURITY.md lists it, by command: the user's own arguments, and pickles.
 PPO_ENV = ["--algo", "ppo", "--env", "Pendulum-v1"]
 PPO_RUN = Path("logs/ppo/Pendulum-v1_1")
 STILL_RUNS = {

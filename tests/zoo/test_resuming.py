@@ -80,7 +80,7 @@ def weights(path: Path) -> th.Tensor:
 
 
 def curves() -> dict[str, list[tuple[int, float]]]:
-    """What TensorBoard shows, but for the time, of the only run."""
+    """TensorBoard's curves of the only run, but for the time."""
     (folder,) = Path("tb/HalfCheetah-v5").iterdir()
     events = EventAccumulator(str(folder)).Reload()
     names = [name for name in events.Tags()["scalars"] if not name.startswith("time/")]
@@ -111,7 +111,7 @@ def assert_same(ours, theirs):
 
 @pytest.fixture(scope="module")
 def straight(minari_folder, tmp_path_factory):
-    """What an undisturbed run comes to."""
+    """Results of an undisturbed run."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("straight"))
         patch.setenv("MINARI_DATASETS_PATH", str(minari_folder))

@@ -1,4 +1,4 @@
-"""What is published: what is in it, and that the wheel works by itself, away from the sources."""
+"""Published files: their contents, and that the wheel works by itself, away from the sources."""
 
 import os
 import shutil

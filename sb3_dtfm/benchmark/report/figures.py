@@ -37,7 +37,7 @@ BANDS: dict[str, dict[str, Any]] = {
     OVER_EPISODES: dict(alpha=0.15, linewidth=0),
     OVER_SEEDS: dict(alpha=0.3, linewidth=0, hatch="////"),
 }
-# What a learning curve is drawn against: the name of the axis, and the line of what the recorded episodes reached.
+# Horizontal axes of a learning curve: the name of the axis, and the style of the line of the recorded episodes.
 X_AXES: dict[str, tuple[str, dict[str, Any]]] = {
     "steps": ("gradient steps", dict(linewidth=1.4, label="recorded episodes")),
     "minutes": ("minutes of training", dict(linewidth=0.8, label=THRESHOLD_NAME)),

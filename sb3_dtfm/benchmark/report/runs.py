@@ -279,7 +279,7 @@ def group_runs(results: Iterable[Result], tasks: Sequence[str] = ()) -> tuple[li
         group.tasks.append(key.task)
         group.runs.setdefault((key.task, key.regime, key.algo), []).append(Run(key, evaluations[key], finals[key]))
     for group in groups.values():
-        # What was changed for a label may not be meant for all tasks.
+        # A label's changes may not be meant for all tasks.
         first = [task for task in tasks if task in group.tasks] if group.label else tasks
         group.tasks[:] = dict.fromkeys([*first, *group.tasks])
     return [groups[key] for key in sorted(groups)], sorted(set(evaluations) - set(finals))

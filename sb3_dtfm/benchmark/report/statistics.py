@@ -90,7 +90,7 @@ def bootstrap(
 
     Which tasks were chosen is chance as well. So tasks are drawn anew, each with all its combinations since those are of a
     kind, and then runs within each combination (the bootstrap over tasks and runs of Agarwal et al., 2021). It errs on the
-    wide side: the runs' own spread is in that of the tasks already. Of a single task it is the bootstrap over its runs.
+    wide side: the runs' own spread is in that of the tasks already. For a single task it is the bootstrap over its runs.
 
     :param statistic: of as many lists of arrays as are given
     :param tasks: of each combination

@@ -45,7 +45,7 @@ def rollout(env, n_steps=15, seed=None, options=None):
     return np.stack(observations)
 
 
-# What MuJoCo, once it has drawn here, has left for PyOpenGL is chosen anew, too.
+# Variables that a new process chooses anew; MuJoCo sets PyOpenGL's once it has drawn here.
 CHOSEN = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "PYTHONHASHSEED")
 
 

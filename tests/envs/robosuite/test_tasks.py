@@ -1,4 +1,4 @@
-"""What every row of the table of tasks promises; with robosuite itself."""
+"""Promises of every row of the table of tasks, with robosuite itself."""
 
 import hashlib
 import json
