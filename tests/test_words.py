@@ -1,7 +1,11 @@
-"""One word an idea: those that an earlier version had are gone from names, messages and pages."""
+"""The project's words: those that an earlier version had are gone, and sentences begin with their subject."""
 
+import ast
+import io
 import re
 import subprocess
+import tokenize
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,12 +20,17 @@ GONE = (
     "CorrectionVecEnv", "SteeredDTFM", "act_from_noise", "carry_out", "own_noise", "hand_out", "take_up", "threads_that_pay",
     "n_products", "from_first", "first_of_each_machine_first", "_memory_errors_named", "naming_the_file", "naming",
     "asking_for", "asked_for", "keep_pace", "finished_cells",
+    "set_solver", "take_up_rows", "take_up_evaluations",
     # prose
     "guided", "steer", "steers", "steered", "steering", "gait", "gaits", "lucky", "luckiest", "peer", "peers", "in sight",
     "what is asked for", "what is seen", "likewise", "goes on online", "going on online", "small profile", "drowns",
     "return to ask for", "target's pace", "ladder",
 )  # fmt: skip
-WORD = re.compile(rf"(?<!\w)({'|'.join(GONE)})(?!\w)", re.IGNORECASE)
+WORD = re.compile(rf"(?<!\w)_?({'|'.join(GONE)})(?!\w)", re.IGNORECASE)
+FOLDERS = ("sb3_dtfm", "envs", "zoo_configs", "tests", "studies", "examples", "docs")
+# Words that begin no sentence but a question.
+ASKS = re.compile(r"(What|Of|Who|Where)\b")
+SENTENCES_END = re.compile(r"""(?<=[.!?])["'`)]*\s+|\n\s*\n|^\s*(?:- |:\w[^:\n]*: )""", re.MULTILINE)
 
 
 def files() -> list[Path]:
@@ -33,6 +42,32 @@ def files() -> list[Path]:
     return [
         ROOT / name for name in listed.stdout.split() if not name.startswith("results/") and name != "tests/test_words.py"
     ]
+
+
+def texts(source: str) -> Iterator[str]:
+    """Docstrings and comments of a file; comments on neighbouring lines are one text."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            yield ast.get_docstring(node) or ""
+    comments: list[str] = []
+    below = None
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            (row, column), text = token.start, token.string.lstrip("# ")
+            if token.start == below:
+                comments[-1] += f"\n{text}"
+            else:
+                comments.append(text)
+            below = (row + 1, column) if token.line.lstrip().startswith("#") else None
+    yield from comments
+
+
+def misbegun(source: str) -> list[str]:
+    """Sentences that begin like a question and are none."""
+    if not ASKS.search(source):
+        return []
+    sentences = (sentence.strip() for text in texts(source) for sentence in SENTENCES_END.split(text))
+    return [sentence for sentence in sentences if ASKS.match(sentence) and not sentence.endswith("?")]
 
 
 def test_words_of_earlier_versions_are_gone():
@@ -48,3 +83,27 @@ def test_words_of_earlier_versions_are_gone():
 
 def test_a_word_is_found():
     assert WORD.findall("Peers steer n_candidates, not return_weighting or a pioneer.") == ["Peers", "steer", "n_candidates"]
+    assert WORD.findall("def _carry_out(self, carry_outs, __carry_out):") == ["carry_out"]
+
+
+def test_sentences_begin_with_their_subject():
+    paths = [path for path in files() if path.suffix == ".py" and path.relative_to(ROOT).parts[0] in FOLDERS]
+    assert paths
+    assert [f"{path.relative_to(ROOT)}: {each}" for path in paths for each in misbegun(path.read_text())] == []
+
+
+def test_a_sentence_is_found():
+    source = '''
+def f(x):
+    """
+    Return x. Where is it? What
+    it was is gone.
+
+    :param x: Of numbers
+    """
+    # Whatever comes. The sum
+    # Of both.
+    y = "# What"  # Who knows
+    return y
+'''
+    assert misbegun(source) == ["What\nit was is gone.", "Of numbers", "Who knows"]
