@@ -1,4 +1,4 @@
-"""Who may import whom: read from the sources, so that no import has to happen."""
+"""Allowed imports between packages, read from the sources, so that no import has to happen."""
 
 import ast
 import os
@@ -157,7 +157,7 @@ def test_every_module_belongs_to_a_package():
     assert set((ROOT / "sb3_dtfm").rglob("*.py")) <= known
 
 
-# Of the extras, a module each. None in `sys.modules` is a package that is not there.
+# One module of each extra. None in `sys.modules` is a package that is not there.
 EXTRAS = (
     "gymnasium_robotics",
     "huggingface_hub",
