@@ -26,6 +26,7 @@ from sb3_dtfm.algorithms.saving import (
 )
 from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, Choice, Number, Rule, check_arguments
 from sb3_dtfm.data import ReturnReference, check_action_space
+from sb3_dtfm.data.readers import check_options
 from sb3_dtfm.envs import OBSERVATION, RETURN_TO_GO, TIMESTEP, image_spaces
 from sb3_dtfm.files import ModelFileError, file_name, read_model
 from sb3_dtfm.optimization import RunningMeans
@@ -173,6 +174,8 @@ def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
     if not isinstance(dataset_kwargs, dict) or set(NEVER_SAVED) & set(dataset_kwargs):
         expected = f"arguments by name, without {' and '.join(NEVER_SAVED)}"
         raise ModelFileError(f"{source}: dataset_kwargs are {dataset_kwargs!r}, expected {expected}.")
+    with wrap_file_errors(f"{source}: dataset_kwargs"):
+        check_options(dataset_kwargs)
     reference = attributes.get("score_reference")
     kinds = [type(each) for each in reference] if isinstance(reference, list) else reference
     if kinds not in (None, [float, float, str]) or (reference and not reference[0] < reference[1]):

@@ -13,6 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
+from sb3_dtfm.files import printable
 from sb3_dtfm.optimization import RunningMeans
 from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.policies.images import extractor_name
@@ -48,8 +49,8 @@ class UnsavedSchedule:
         :raises ValueError: asks for the function
         """
         raise ValueError(
-            f"learning_rate was the function {self.name} when this model was saved, and a file holds no functions: give it "
-            "again, load(path, learning_rate=...)."
+            f"learning_rate was the function {printable(self.name)} when this model was saved, and files hold no functions: "
+            "give it again, load(path, learning_rate=...)."
         )
 
 

@@ -26,7 +26,7 @@ from sb3_dtfm.benchmark.grid import Job
 from sb3_dtfm.benchmark.provenance import n_cores
 from sb3_dtfm.benchmark.rows import BASELINES, RowError, finished_runs, read_rows
 from sb3_dtfm.files import replacing
-from sb3_dtfm.zoo.resuming import START
+from sb3_dtfm.zoo.resuming import CHECKPOINT, START
 
 TRAIN = [sys.executable, "-m", "sb3_dtfm", "train"]
 CLONE = [sys.executable, "-m", "sb3_dtfm.benchmark.cloning"]
@@ -90,7 +90,7 @@ class Runner:
         """
         A folder with a run's settings, new for each attempt: an orphan may still be writing into an older one.
 
-        The last attempt's files are copied if its settings were equal.
+        The files of the last attempt with equal settings are copied. An interrupted attempt with other settings is kept.
         """
         logs, options, env_id = Path(self.options.log_folder) / job.key.file_name, self.options, job.task.env_id
         logs.mkdir(parents=True, exist_ok=True)
@@ -109,13 +109,16 @@ class Runner:
         callbacks = [*(own if isinstance(own, list) else [own]), {CALLBACK: arguments}]
         settings = yaml.safe_dump({env_id: {**job.settings, "callback": callbacks}})
         (folder / SETTINGS).write_text(settings)
-        for attempt in earlier[-1:]:
+        equal = [attempt for attempt in earlier if _settings_of(attempt).replace(str(attempt), str(folder)) == settings]
+        for attempt in equal[-1:]:
             with contextlib.suppress(OSError):  # killed before it had anything
-                if (attempt / SETTINGS).read_text().replace(str(attempt), str(folder)) == settings:
-                    shutil.copytree(attempt / LOGS, folder / LOGS)
-                    shutil.copyfile(attempt / ROWS, folder / ROWS)
+                shutil.copytree(attempt / LOGS, folder / LOGS)
+                shutil.copyfile(attempt / ROWS, folder / ROWS)
         for attempt in earlier:
-            shutil.rmtree(attempt, ignore_errors=True)
+            if attempt in equal or not any(attempt.rglob(CHECKPOINT)):
+                shutil.rmtree(attempt, ignore_errors=True)
+            else:
+                _say(f"{job.key}: {attempt} holds an interrupted run with other settings, which is kept")
         return folder
 
     def _train(self, job: Job, folder: Path) -> None:
@@ -247,3 +250,10 @@ def run_grid(jobs: Sequence[Job], n_finished: int, options: argparse.Namespace) 
             print(f"{log}: {(log.read_text().strip().splitlines() or ['nothing was written'])[-1]}")
         raise SystemExit(1)
     print(f"All {len(jobs) + n_finished} runs are finished: sb3-dtfm report {options.results}", flush=True)
+
+
+def _settings_of(attempt: Path) -> str:
+    """Read the settings of an attempt, empty if it was killed before it had any."""
+    with contextlib.suppress(OSError):
+        return (attempt / SETTINGS).read_text()
+    return ""

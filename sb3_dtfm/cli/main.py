@@ -75,7 +75,9 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _fail(command: str, message: str) -> int:
-    print(f"sb3-dtfm {command}: error: {message}", file=sys.stderr)
+    from sb3_dtfm.files import printable  # with torch, which --help and --version do not wait for
+
+    print(f"sb3-dtfm {command}: error: {printable(message)}", file=sys.stderr)
     return 2
 
 

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.report.statistics import wilson
+from sb3_dtfm.zoo.resuming import EPISODES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -114,13 +116,19 @@ def plot_learning_curve(
             axes[1].set(ylabel="train/loss", title="training", yscale="log")
             axes[1].grid(which="minor", color="0.95")
         for axis in axes:
-            axis.set(xlabel="gradient steps", xlim=(0, None))
+            axis.set(xlabel=_counted(Path(run_folder)), xlim=(0, None))
             axis.xaxis.set_major_locator(MaxNLocator("auto", integer=True))
             axis.grid(color="0.9")
         figure.suptitle(title or Path(run_folder).name)
         Path(output).parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(output, dpi=150)
     return Path(output)
+
+
+def _counted(run: Path) -> str:
+    """Name what the time steps of a run count."""
+    offline = run.parent.name in ALGORITHMS and not (run / EPISODES).exists()
+    return "gradient steps" if offline else "timesteps"
 
 
 def _draw_evaluations(axis: "Axes", evaluations: dict[str, np.ndarray]) -> None:

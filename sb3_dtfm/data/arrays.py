@@ -172,11 +172,11 @@ class _Npz(Arrays):
 class _Hdf5(Arrays):
     """Arrays at the top of an opened hdf5 file; observations may be a group of arrays."""
 
-    def __init__(self, file: h5py.File, source: str) -> None:
+    def __init__(self, file: h5py.Group, source: str) -> None:
         check_within(file, "infos", source)
         infos = file.get("infos")
         within = {f"infos/{name}" for name in infos} if isinstance(infos, h5py.Group) else set()
-        super().__init__(source, {*file, *within}, os.path.getsize(source))
+        super().__init__(source, {*file, *within}, file.file.id.get_filesize())
         self._file = file
 
     def _get(self, name: str, where: str) -> Any:
@@ -288,9 +288,14 @@ def opened(dataset: Any) -> Iterator[Arrays]:
     """
     Open arrays while they are read.
 
-    :param dataset: path of the file, arrays by name, or a DataFrame
+    :param dataset: path of the file, an opened hdf5 file or a group in it, arrays by name, or a DataFrame
     :raises DatasetError: no such file, or a damaged one
     """
+    if isinstance(dataset, h5py.Group):
+        source = f"{dataset.file.filename}{dataset.name.rstrip('/')}"
+        with wrap_dataset_errors(source):
+            yield _Hdf5(dataset, source)
+        return
     if isinstance(dataset, Mapping):
         yield _InMemory(dataset)
         return

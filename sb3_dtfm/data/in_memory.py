@@ -1,6 +1,7 @@
 """Reading what is already in memory into a `TrajectoryBuffer`: lists of episodes, and SB3's replay buffers."""
 
 import itertools
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -263,9 +264,9 @@ def load_replay_buffer(
 
     SB3's algorithms store actions of a Box scaled to [-1, 1]; they are brought back into the buffer's action space.
     Observations and rewards are there as the environment gave them, `VecNormalize` or not. An episode at whose end
-    `TimeLimit.truncated` was said is truncated. One that a second `learn()` has cut off just stops, as the last one of each
-    environment does where the buffer ends; of a full
-    buffer, the first one of each environment is left out, since its beginning has been written over.
+    `TimeLimit.truncated` was said is truncated. Unfinished episodes, which the buffer's end or a second `learn()` cut off,
+    are left out if there are finished ones. The first episode of each environment in a full buffer is left out, since its
+    beginning has been written over.
 
     :param replay_buffer: of any number of environments
     :param observation_keys: which entries of dictionary observations make up the observation, in this order
@@ -284,11 +285,21 @@ def load_replay_buffer(
     ends = replay_buffer.dones[order] > 0
     ends[:-1] |= _breaks(replay_buffer, order)
     ends[-1:] = True  # so far
-    pieces = []
+    pieces, unfinished = [], []
     for env in range(replay_buffer.n_envs):
         stops = np.flatnonzero(ends[:, env]) + 1
         starts = np.concatenate(([0], stops[:-1])) if len(stops) else stops
-        pieces += [(env, *piece) for piece in zip(starts, stops, strict=True)][int(replay_buffer.full) :]
+        for start, stop in list(zip(starts, stops, strict=True))[int(replay_buffer.full) :]:
+            finished = replay_buffer.dones[order[stop - 1], env] > 0
+            (pieces if finished else unfinished).append((env, start, stop))
+    if pieces and unfinished:  # their returns would be those of their first steps alone
+        n_left_out = sum(stop - start for _, start, stop in unfinished)
+        warnings.warn(
+            f"{source}: {len(unfinished)} unfinished episodes with {n_left_out} steps are left out, which another learn() "
+            "or the buffer's end cut off.",
+            stacklevel=3,
+        )
+    pieces = pieces or unfinished
     if not pieces:
         raise DatasetError(f"{source}: holds no whole episode in {n_steps} steps of {replay_buffer.n_envs} environments.")
 

@@ -48,6 +48,9 @@ ACCEPTED: dict[str, Rule] = {
     "allow_pickle": BOOLEAN,
     "min_return": Number(optional=True),
     "max_episode_steps": Number(low=1, whole=True, optional=True),
+    "best_share": Number(low=0.0, high=1.0, above_low=True, optional=True),
+    "fraction": Number(low=0.0, high=1.0, above_low=True),
+    "fraction_seed": Number(low=0, whole=True),
 }
 
 
@@ -183,7 +186,7 @@ def load_dataset(
     :raises TypeError: the reader has no such option
     """
     named = {"cache_dir": cache_dir, "env_id": env_id, "max_episode_steps": max_episode_steps, "min_return": min_return}
-    _check_options({**kwargs, **named, "success_only": success_only, "allow_pickle": allow_pickle})
+    check_options({**kwargs, **named, "success_only": success_only, "allow_pickle": allow_pickle})
     dataset = unpickled(dataset, allow_pickle)
     reader = _find_reader(dataset)
     parameters = inspect.signature(reader.load).parameters
@@ -219,14 +222,16 @@ def load_dataset(
     return buffer.best(min_return, best_share, success_only).random_fraction(fraction, fraction_seed)
 
 
-def _check_options(given: dict[str, Any]) -> None:
+def check_options(given: dict[str, Any]) -> None:
     """
+    Check options of :func:`load_dataset` before anything is read.
+
     :param given: values by name
     :raises ValueError: names the option, what was given and what is accepted
     """
     check_arguments(given, {name: rule for name, rule in ACCEPTED.items() if name in given})
     for name in ("cache_dir", "env_id"):
-        value = given[name]
+        value = given.get(name)
         kinds = str if name == "env_id" else (str, os.PathLike)
         if value is not None and not (isinstance(value, kinds) and str(value)):
             expected = "the path of a folder" if name == "cache_dir" else "the id of an environment"

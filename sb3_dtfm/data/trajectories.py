@@ -11,6 +11,7 @@ from gymnasium import spaces
 
 from sb3_dtfm.actions import ActionSpace
 from sb3_dtfm.envs.return_to_go import check_image_shape
+from sb3_dtfm.files import printable
 
 # Recorded float64 actions may pass a float32 bound by a rounding error; beyond this share of the range they are wrong.
 ACTION_TOLERANCE = 1e-4
@@ -26,7 +27,14 @@ SURELY_FINITE = 1e37
 
 
 class DatasetError(ValueError):
-    """A dataset cannot be used. The message names the file, episode and step, what was found and what is accepted."""
+    """
+    A dataset cannot be used.
+
+    :param message: names the file, episode and step, what was found and what is accepted
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message))
 
 
 class ActionRangeError(DatasetError):

@@ -10,6 +10,7 @@ from sb3_dtfm.files.model import (
     write_model,
 )
 from sb3_dtfm.files.onnx import write_onnx
+from sb3_dtfm.files.printing import printable
 from sb3_dtfm.files.replacing import find_leftovers, hidden_name, replacing
 from sb3_dtfm.files.run import CLASSES, EVALUATED, check_settings, literal, read_run, settings_loader
 
@@ -24,6 +25,7 @@ __all__ = [
     "hidden_name",
     "holds_pickles",
     "literal",
+    "printable",
     "read_configuration",
     "read_model",
     "read_run",

@@ -20,6 +20,7 @@ from safetensors.torch import save as save_tensors
 from stable_baselines3 import __version__ as sb3_version
 from stable_baselines3.common.utils import get_system_info
 
+from sb3_dtfm.files.printing import printable
 from sb3_dtfm.files.replacing import replacing
 
 FORMAT = 1
@@ -41,12 +42,11 @@ class ModelFileError(ValueError):
     """
     A file is no model that can be loaded.
 
-    :param message: names the file, the member, what was found and what is accepted; control characters, which a file may
-        hold to change what a terminal shows, are written as escapes
+    :param message: names the file, the member, what was found and what is accepted
     """
 
     def __init__(self, message: str) -> None:
-        super().__init__("".join(each if each.isprintable() else repr(each)[1:-1] for each in message))
+        super().__init__(printable(message))
 
 
 class ModelFile(NamedTuple):

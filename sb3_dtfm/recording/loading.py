@@ -165,7 +165,10 @@ def check_saved_by(asked: type[BaseAlgorithm], model: Path) -> None:
     docstring. They are nearest to those of the class that saved them, whichever version that was.
     """
     if not holds_pickles(model):
-        saved_by = str(read_configuration(model).get("algorithm"))
+        configuration = read_configuration(model)
+        saved_by = str(configuration.get("algorithm"))
+        if configuration["attributes"].get("online_actor") is not None:
+            saved_by = f"Finetuned{saved_by}"
         if not issubclass(asked, SequenceModel) or saved_by != head_name(asked.policy_aliases):
             raise ValueError(f"{model} was saved by {saved_by}, not by {asked.__name__} (--algo).")
         return

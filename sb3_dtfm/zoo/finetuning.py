@@ -1,5 +1,6 @@
 """RL-Zoo's experiments that start from a DTFM: noise-space RL, residual RL, or DTFM's own online fine-tuning."""
 
+import filecmp
 import inspect
 import os
 import shutil
@@ -25,12 +26,10 @@ from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.recording.loading import check_saved_by
 from sb3_dtfm.zoo.arguments import UsageError, with_target_return
 from sb3_dtfm.zoo.manager import OF_RL_ZOO, OfflineExperimentManager
-from sb3_dtfm.zoo.resuming import EPISODES, StopSignals
+from sb3_dtfm.zoo.resuming import AGENT, EPISODES, StopSignals
 
 # Environments to learn in, by the key of their settings in a run's config.yml, where `enjoy` must not find a wrapper.
 FROZEN_ENVS = {"noise_env": NoiseActionVecEnv, "residual_env": ResidualActionVecEnv}
-# The online algorithm itself, as Stable-Baselines3 saves it.
-AGENT = "agent"
 # Arguments of an algorithm that the command line gives.
 OF_THE_COMMAND = ("env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model")
 
@@ -88,6 +87,7 @@ class FinetunedCallbacks(BaseCallback):
 
     def _take_over(self) -> None:
         self.finetuned.num_timesteps = self.model.num_timesteps
+        self.finetuned._n_updates = getattr(self.model, "_n_updates", 0)
         if has_learned(self.model):
             self.finetuned.take_actor(self.model)
 
@@ -185,7 +185,8 @@ class FinetunedManager(FinetuningManager):
             try:
                 check_saved_by(ALGOS[self.algo], Path(self.trained_agent))
             except ValueError as error:
-                raise UsageError(f"-i: {error} It takes the agent.zip of a run of `finetune`.") from error
+                raise UsageError(f"-i: {error} It takes the {AGENT}.zip of a run of `finetune`.") from error
+            self._check_same_model(Path(self.trained_agent))
         self.finetuned = FinetunedDTFM.of(DTFM.load(self.base_file, device=self.device))
         name = Path(self.save_path).name.removeprefix(f"{self.env_name}_")
         uuid = name.lstrip("0123456789")
@@ -193,6 +194,16 @@ class FinetunedManager(FinetuningManager):
         number = get_latest_run_id(self.log_path, self.env_name) + 1
         self.save_path = os.path.join(self.log_path, f"{self.env_name}_{number}{uuid}")
         self.params_path = f"{self.save_path}/{self.env_name}"
+
+    def _check_same_model(self, agent: Path) -> None:
+        """
+        :raises UsageError: the agent learned the noise or the residual actions of another DTFM
+        """
+        run = agent.parent / self.env_name
+        known = read_run(run) if (run / "config.yml").is_file() else {}
+        learned_on = next((Path(known[key]["model"]) for key in FROZEN_ENVS if key in known), self.base_file)
+        if learned_on.is_file() and not filecmp.cmp(learned_on, self.base_file, shallow=False):
+            raise UsageError(f"-i {agent}: it learned on {learned_on}, and --model is another DTFM, {self.base_file}.")
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Read the settings of the online algorithm, and of the wrapper that it learns in."""
@@ -240,22 +251,35 @@ class FinetunedManager(FinetuningManager):
             each for each in self.callbacks if isinstance(each, EvalCallback | CheckpointCallback)
         ]
         others = [each for each in self.callbacks if each not in of_the_model]
+        if self.save_freq > 0:  # RL-Zoo has divided it by the number of environments
+            others.append(CheckpointCallback(self.save_freq, self.save_path, name_prefix=AGENT))
         self.callbacks = [*others, FinetunedCallbacks(self.finetuned, of_the_model, self.seed, self.signals)]
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         """
         Set up as RL-Zoo does.
 
-        :raises ValueError: an actor that cannot be taken over
+        :raises ValueError: an actor that cannot be taken over, or a replay buffer of another number of environments
         """
-        result = super().setup_experiment()
-        assert result is not None
         try:
+            result = super().setup_experiment()
+            assert result is not None
             FinetunedDTFM.of(self.finetuned, result[0])
         except ValueError:
-            shutil.rmtree(self.save_path)
+            shutil.rmtree(self.save_path, ignore_errors=True)
             raise
         return result
+
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        """Load an agent as RL-Zoo does, with the replay buffer beside it."""
+        model = super()._load_pretrained_agent(hyperparams, env)
+        buffer = getattr(model, "replay_buffer", None)
+        if buffer is not None and buffer.n_envs != env.num_envs:
+            raise UsageError(
+                f"-i {self.trained_agent}: the replay buffer beside it is of {buffer.n_envs} environments, and there are "
+                f"{env.num_envs} now; -params n_envs:{buffer.n_envs} keeps their number."
+            )
+        return model
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """

@@ -143,7 +143,12 @@ class OfflineExperimentManager(ExperimentManager):
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Read settings as RL-Zoo does; policy options may stand among them, and the ReturnToGoWrapper may be left out."""
         listed_settings(self.config, self.env_name.gym_id)  # whose errors name the file
-        hyperparams, saved = super().read_hyperparameters()
+        try:
+            hyperparams, saved = super().read_hyperparameters()
+        except IndexError as error:
+            if self.trial_id is None:
+                raise
+            raise UsageError(f"--trial-id {self.trial_id}: study {self.study_name!r} has no such trial.") from error
         if self.restored is not None:
             hyperparams = self.restored.check_config(self.config, hyperparams)
         self._check_settings(hyperparams)

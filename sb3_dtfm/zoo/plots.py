@@ -16,6 +16,7 @@ ONE_RUN = (
     "plot_from_file draws nothing of which there is one run alone: train another one, or leave it out with --skip-keys."
 )
 
+UNEQUAL = "all_plots averages the evaluations of runs with equal numbers of episodes; these had different --eval-episodes."
 NOTHING = "nothing to draw in the folders of these algorithms and tasks, or fewer episodes than plot_train's window, -w."
 
 
@@ -44,6 +45,8 @@ def draw(name: str, arguments: Sequence[str]) -> list[Path]:
         except ValueError as error:
             if name == "plot_from_file" and str(error).startswith("min() "):
                 raise UsageError(ONE_RUN) from error
+            if "inhomogeneous" in str(error):
+                raise UsageError(UNEQUAL) from error
             raise
     return [] if folder is None else _save(name, folder)
 

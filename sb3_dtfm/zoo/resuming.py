@@ -30,6 +30,8 @@ CHECKPOINT = "checkpoint.zip"
 LOCK = ".lock"
 # Beside a model that learns online: its own episodes.
 EPISODES = "episodes.npz"
+# Online algorithm of a run of "finetuned", as Stable-Baselines3 saves it.
+AGENT = "agent"
 CHECKPOINT_INTERVAL = 60.0  # seconds of training that a killed run loses at most
 STOPPING = b"\nStopping after this gradient step, or in the midst of an evaluation; once more stops at once.\n"
 
@@ -66,6 +68,9 @@ class Start(NamedTuple):
         if not run.is_dir():
             raise UsageError(f"--resume {run}: no such folder; expected that of a run, as logs/dtfm/HalfCheetah-v5_1.")
         if not (run / START).is_file():
+            agents = sorted(run.glob(f"{AGENT}*.zip"), key=lambda path: path.stat().st_mtime)
+            if agents:
+                raise UsageError(f"--resume {run}: only --algo dtfm resumes; -i {agents[-1]} continues this in a new run.")
             raise UsageError(
                 f"--resume {run}: nothing to go on with; the run is finished, or `sb3-dtfm {command}` did not start it."
             )

@@ -54,6 +54,7 @@ def test_a_run_is_finetuned_and_played(run, workplace, capsys):
     evaluations = np.load(finetuned / "evaluations.npz")
     assert evaluations["timesteps"].tolist() == [0, 10, 20, 24]
     assert evaluations["ep_lengths"].max() == 20, "environment's steps, of the run's own environment"
+    assert SAC.load(finetuned / "agent_12_steps").num_timesteps == 12
     first, last = (FinetunedDTFM.load(finetuned / name) for name in ("rl_model_12_steps", "HalfCheetah-v5"))
     assert last.online_actor == {
         "layers": [16],
@@ -159,7 +160,7 @@ def test_ten_evaluations_are_made_where_nothing_is_said(run, workplace):
     ]
     assert main(command) == 0
     evaluations = np.load(workplace / "logs/finetuned/HalfCheetah-v5_1/evaluations.npz")
-    assert evaluations["timesteps"].tolist() == list(range(0, 41, 4))
+    assert evaluations["timesteps"].tolist() == [*range(0, 41, 4), 40], "and after the last gradient step"
 
 
 @pytest.mark.parametrize(("algorithm", "quick"), [(SAC, QUICK), (PPO, QUICK_PPO)])
@@ -183,6 +184,7 @@ def test_ppo_corrects_a_zip_file_with_a_target_of_its_own(run, workplace, capsys
     model = FinetunedDTFM.load(finetuned / "HalfCheetah-v5")
     agent = PPO.load(finetuned / "agent")
     np.testing.assert_array_equal(agent.policy.action_net.weight.detach(), model.policy.online_actor.mean.weight)
+    assert np.load(finetuned / "evaluations.npz")["timesteps"][-1] == agent.num_timesteps
     assert model.online_actor["residual"]
     assert model.policy.options.n_action_steps == 1
     output = capsys.readouterr().out
@@ -275,6 +277,17 @@ def test_the_online_algorithm_goes_on_learning(run, workplace, algorithm, quick)
     assert after._n_updates > algorithm.load(agent)._n_updates
 
 
+@pytest.mark.slow
+def test_a_replay_buffer_goes_on_with_as_many_environments(run, workplace, capsys):
+    arguments = [*FINETUNE, "--model", str(run), "--save-replay-buffer", "-params", *QUICK]
+    assert main(arguments) == 0
+    agent = "logs/finetuned/HalfCheetah-v5_1/agent.zip"
+    assert main([*arguments, "n_envs:2", "-i", agent]) == 2
+    message = f"-i {agent}: the replay buffer beside it is of 1 environments, and there are 2 now; -params n_envs:1 keeps"
+    assert message in capsys.readouterr().err
+    assert len(list((workplace / "logs/finetuned").iterdir())) == 1
+
+
 def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
     assert main(tiny_training("dt", "dataset:" + repr(DATASET_ID))) == 0
     (workplace / "alone.zip").write_bytes((run / "HalfCheetah-v5.zip").read_bytes())
@@ -282,6 +295,10 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
     untold.target_return = None
     untold.save("untold")
     SAC("MlpPolicy", "Pendulum-v1", buffer_size=1).save("agent")
+    cut = workplace / "cut/HalfCheetah-v5"
+    cut.mkdir(parents=True)
+    (cut / "config.yml").write_text("!!python/object/apply:collections.OrderedDict [[[noise_env, {model: untold.zip}]]]")
+    (cut.parent / "agent_9_steps.zip").write_bytes((workplace / "agent.zip").read_bytes())
     (workplace / "mine.yml").write_text("default: {policy: MlpPolicy, n_steps: 8, batch_size: 8, n_timestep: 64}")
     wrong = "vec_env_wrapper:['stable_baselines3.common.vec_env.VecMonitor']"
     cases = {
@@ -302,6 +319,8 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
         f"--model {run} -params use_sde:True": "its exploration depends on the state (use_sde)",
         f"--model {run} --algo ppo -i agent.zip": "-i: agent.zip was saved by SAC, not by PPO (--algo). It takes",
         f"--model {run} --algo sac -i untold.zip": "-i: untold.zip was saved by DTFM, not by SAC (--algo).",
+        f"--model {run} --algo sac -i cut/agent_9_steps.zip": "it learned on untold.zip, and --model is another DTFM, logs/",
+        "--resume cut": "only --algo dtfm resumes; -i cut/agent_9_steps.zip continues this in a new run.",
         f"--model {run} --algo ppo --conf-file mine.yml": "n_timestep (did you mean n_timesteps?): no hyperparameter",
         f"--model {run} --algo ppo --conf-file mine.yml -n -1": "n_timesteps: the settings have none; add it there, or give",
         f"--model {run} -optimize": "-optimize: hyperparameters of finetune cannot be searched",

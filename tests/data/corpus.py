@@ -269,15 +269,19 @@ def some_chunks(file: h5py.File, path: str, folder: Path) -> None:
     data[:4] = array[:4]
 
 
-def short_chunk(compression: str | None) -> Callable[[h5py.File, str, Path], object]:
-    """One chunk has a byte of its many."""
+def short_chunk(
+    stored: bytes, filter_mask: int = 0, overlong: bool = False, **filters: Any
+) -> Callable[[h5py.File, str, Path], object]:
+    """One chunk has a byte of its many; `overlong`: another one has more than it needs."""
 
     def change(file: h5py.File, path: str, folder: Path) -> None:
         array = file[path][()]
         del file[path]
         chunks = (2, *array.shape[1:])
-        data = file.create_dataset(path, data=array, chunks=chunks, compression=compression)
-        data.id.write_direct_chunk((0,) * array.ndim, zlib.compress(b"1") if compression else b"1")
+        data = file.create_dataset(path, data=array, chunks=chunks, **filters)
+        data.id.write_direct_chunk((0,) * array.ndim, stored, filter_mask)
+        if overlong:
+            data.id.write_direct_chunk((2,) + (0,) * (array.ndim - 1), bytes(3 * data[:2].nbytes))
 
     return change
 
@@ -299,8 +303,12 @@ HDF5: dict[str, tuple[Callable[[h5py.File, str, Path], object], str | None]] = {
     "link through a pipe": (link_through_pipe, None),
     "virtual over a pipe": (virtual_over_pipe, None),
     "some chunks unwritten": (some_chunks, None),
-    "a short chunk": (short_chunk(None), None),
-    "a short compressed chunk": (short_chunk("gzip"), None),
+    "a short chunk": (short_chunk(b"1"), None),
+    "a short and a long chunk": (short_chunk(b"1", overlong=True), None),
+    "a short shuffled chunk": (short_chunk(b"1", shuffle=True), None),
+    "a short compressed chunk": (short_chunk(zlib.compress(b"1"), compression="gzip"), None),
+    "a short lzf chunk": (short_chunk(b"\x001", compression="lzf"), None),
+    "a short chunk beside lzf": (short_chunk(b"1", filter_mask=1, compression="lzf"), None),
     "storage in another file": (external_storage, None),
     "virtual": (virtual, None),
     "unwritten": (unwritten, None),
@@ -310,6 +318,7 @@ HDF5: dict[str, tuple[Callable[[h5py.File, str, Path], object], str | None]] = {
     "compressed": (recreate(compression="gzip", chunks=True), SAME),
     "in chunks": (recreate(chunks=True), SAME),
     "with checksums": (recreate(fletcher32=True, chunks=True), SAME),
+    "lzf": (recreate(compression="lzf", chunks=True, shuffle=True, fletcher32=True), SAME),
     "references": (
         lambda file, path, folder: replace(
             file, path, lambda array: file.create_dataset(path, data=[file.ref] * len(array), dtype=h5py.ref_dtype)

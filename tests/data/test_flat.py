@@ -1,6 +1,7 @@
 """Flat arrays in one file: what is read, and what is refused."""
 
 import io
+import os
 import warnings
 import zipfile
 
@@ -179,6 +180,29 @@ def test_arrays_that_are_not_read_may_hold_anything(path):
         archive.writestr("notes.txt", "hello")
     with pytest.warns(UserWarning, match="huge has an image of shape .1048576, 1048576, 3."):
         assert len(load_dataset(path)) == N
+
+
+def test_control_characters_of_names_are_not_printed(path):
+    write(path, actions=None, **{"\x1b[2J": np.zeros(N)})
+    with pytest.raises(DatasetError, match=r"only \\x1b\[2J, episode_ends, obs") as refusal:
+        load_dataset(path)
+    assert "\x1b" not in str(refusal.value)
+
+
+def test_an_opened_hdf5_file_is_read_like_a_path(tmp_path):
+    """Links in it too: a pipe behind one would wait for ever."""
+    os.mkfifo(tmp_path / "pipe")
+    with h5py.File(tmp_path / "episodes.hdf5", "w") as file:
+        for name, array in arrays().items():
+            file[name] = file[f"part/{name}"] = array
+        for opened in (file, file["part"]):
+            assert load_dataset(opened).episode_lengths.tolist() == [2, 3, 4]
+        file["another"] = h5py.ExternalLink(str(tmp_path / "pipe"), "/")
+        assert load_dataset(file).n_episodes == 3
+        del file["part/rewards"]
+        file["part/rewards"] = h5py.ExternalLink(str(tmp_path / "pipe"), "/")
+        with pytest.raises(DatasetError, match=r"episodes\.hdf5/part: 'rewards' lies in another file"):
+            load_dataset(file["part"])
 
 
 def test_bounds_of_actions(path):

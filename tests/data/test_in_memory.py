@@ -374,7 +374,8 @@ def test_the_replay_buffer_of_an_sb3_model(goal, buffer_size):
         "MultiInputPolicy" if goal else "MlpPolicy", VecNormalize(env, **keys), seed=0, buffer_size=buffer_size,
         learning_starts=100, train_freq=(20, "step"), batch_size=8, policy_kwargs={"net_arch": [4]}, device="cpu",
     ).learn(60)  # fmt: skip
-    buffer = load_dataset(model.replay_buffer)
+    with pytest.warns(UserWarning, match=r"replay buffer: \d unfinished episodes with \d+ steps are left out"):
+        buffer = load_dataset(model.replay_buffer)
     first = 1 if buffer_size == 40 else 0
     assert buffer.observation_space.shape == (5 if goal else 3,)
     n_steps, kept = len(courses[0].done), min(len(courses[0].done), buffer_size // 2)
@@ -385,18 +386,15 @@ def test_the_replay_buffer_of_an_sb3_model(goal, buffer_size):
             t += 4 if len(ends) % 2 == 0 else 7
             ends.append(t)
         starts = [0, *ends[:-1]]
-        whole = [
-            (n, s, min(e, n_steps), e <= n_steps) for n, (s, e) in enumerate(zip(starts, ends, strict=True)) if s < n_steps
-        ]
-        inside = [piece for piece in whole if piece[2] > n_steps - kept][first:]
-        expected += [(course, *piece) for piece in inside]
-    assert buffer.episode_lengths.tolist() == [e - s for _, _, s, e, _ in expected]
-    assert buffer.terminated.tolist() == [ended and n % 2 == 0 for _, n, _, _, ended in expected]
-    assert buffer.truncated.tolist() == [ended and n % 2 == 1 for _, n, _, _, ended in expected]
-    actions = np.concatenate([course.done[s:e] for course, _, s, e, _ in expected])
+        whole = [(n, s, e) for n, (s, e) in enumerate(zip(starts, ends, strict=True)) if n_steps - kept < e]
+        expected += [(course, *piece) for piece in whole[first:] if piece[2] <= n_steps]
+    assert buffer.episode_lengths.tolist() == [e - s for _, _, s, e in expected]
+    assert buffer.terminated.tolist() == [n % 2 == 0 for _, n, _, _ in expected]
+    assert buffer.truncated.tolist() == [n % 2 == 1 for _, n, _, _ in expected]
+    actions = np.concatenate([course.done[s:e] for course, _, s, e in expected])
     np.testing.assert_allclose(buffer.actions, actions, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(buffer.rewards, actions.sum(axis=1), rtol=1e-5)
-    seen = [[t, n, 0.5] for _, n, s, e, _ in expected for t in range(e - s)]
+    seen = [[t, n, 0.5] for _, n, s, e in expected for t in range(e - s)]
     np.testing.assert_array_equal(buffer.observations[:, -3:], np.array(seen, np.float32))
     if goal:
         np.testing.assert_array_equal(
@@ -407,14 +405,23 @@ def test_the_replay_buffer_of_an_sb3_model(goal, buffer_size):
 
 @pytest.mark.parametrize("goal", [False, True])
 def test_a_second_learn_begins_another_episode(goal):
-    """It resets the environment without a word to the buffer: what was going on then just stops."""
+    """It resets the environment without a word to the buffer: the episode of that time is unfinished, and left out."""
     small = dict(learning_starts=100, buffer_size=50, policy_kwargs={"net_arch": [4]}, device="cpu", seed=0)
     env = make_vec_env(lambda: TimeLimit(Course(goal), 7))
     model = DDPG("MultiInputPolicy" if goal else "MlpPolicy", env, train_freq=(1, "step"), **small).learn(6).learn(9)
-    buffer = load_dataset(model.replay_buffer)
-    assert buffer.episode_lengths.tolist() == [4, 2, 4, 5]
-    assert buffer.terminated.tolist() == [True, False, True, False]
-    assert not buffer.truncated.any()
+    with pytest.warns(UserWarning, match="replay buffer: 2 unfinished episodes with 7 steps are left out"):
+        buffer = load_dataset(model.replay_buffer)
+    assert buffer.episode_lengths.tolist() == [4, 4]
+    assert buffer.terminated.all()
+
+
+def test_an_episode_without_an_end_is_all_that_there_is():
+    buffer = ReplayBuffer(5, spaces.Box(-1, 1, (1,)), spaces.Box(-1, 1, (1,)), device="cpu")
+    for step in range(4):
+        buffer.add(*np.full((4, 1), step / 10), np.zeros(1), [{}])
+    loaded = load_dataset(buffer)
+    assert loaded.episode_lengths.tolist() == [4]
+    assert not loaded.terminated[0]
 
 
 def test_a_replay_buffer_without_a_whole_episode():

@@ -118,6 +118,8 @@ def test_a_run_learns_with_the_first_trial_of_a_study(workplace, capsys):
     assert main(tiny_training("dtfm", "--dataset", DATASET_ID, *study, *search)) == 0
     capsys.readouterr()
     command = ["train", "--algo", "dtfm", "--env", "HalfCheetah-v5", "--dataset", DATASET_ID, "-n", "1", "--eval-freq", "-1"]
+    assert main([*command, *study, "--trial-id", "99"]) == 2
+    assert "--trial-id 99: study" in capsys.readouterr().err
     assert main([*command, *study, "--trial-id", "0"]) == 0
     assert "Loading from Optuna study" in capsys.readouterr().out
 
