@@ -167,10 +167,9 @@ def check_saved_by(asked: type[BaseAlgorithm], model: Path) -> None:
     if not holds_pickles(model):
         configuration = read_configuration(model)
         saved_by = str(configuration.get("algorithm"))
-        if configuration["attributes"].get("online_actor") is not None:
-            saved_by = f"Finetuned{saved_by}"
         if not issubclass(asked, SequenceModel) or saved_by != head_name(asked.policy_aliases):
-            raise ValueError(f"{model} was saved by {saved_by}, not by {asked.__name__} (--algo).")
+            finetuned = "Finetuned" if configuration["attributes"].get("online_actor") is not None else ""
+            raise ValueError(f"{model} was saved by {finetuned}{saved_by}, not by {asked.__name__} (--algo).")
         return
     try:
         with zipfile.ZipFile(model) as file:

@@ -319,8 +319,7 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
         f"--model {run} -params use_sde:True": "its exploration depends on the state (use_sde)",
         f"--model {run} --algo ppo -i agent.zip": "-i: agent.zip was saved by SAC, not by PPO (--algo). It takes",
         f"--model {run} --algo sac -i untold.zip": "-i: untold.zip was saved by DTFM, not by SAC (--algo).",
-        f"--model {run} --algo sac -i cut/agent_9_steps.zip": "it learned on untold.zip, and --model is another DTFM, logs/",
-        "--resume cut": "only --algo dtfm resumes; -i cut/agent_9_steps.zip continues this in a new run.",
+        f"--model {run} --algo sac -i cut/agent_9_steps.zip": "it learned on untold.zip, and --model is another DTFM, ",
         f"--model {run} --algo ppo --conf-file mine.yml": "n_timestep (did you mean n_timesteps?): no hyperparameter",
         f"--model {run} --algo ppo --conf-file mine.yml -n -1": "n_timesteps: the settings have none; add it there, or give",
         f"--model {run} -optimize": "-optimize: hyperparameters of finetune cannot be searched",
@@ -329,6 +328,8 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
         capsys.readouterr()
         assert main([*FINETUNE, *arguments.split()]) == 2, arguments
         assert message in capsys.readouterr().err, arguments
+    assert main(["finetune", "--resume", "cut"]) == 2
+    assert "only --algo dtfm resumes; -i cut/agent_9_steps.zip continues this in a new run." in capsys.readouterr().err
     assert main(["train", "--algo", "finetuned", "--env", "HalfCheetah-v5"]) == 2
     assert "--algo finetuned: such models come from `sb3-dtfm finetune`" in capsys.readouterr().err
     assert not list((workplace / "logs").glob("finetuned/*"))

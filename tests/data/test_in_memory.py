@@ -418,7 +418,7 @@ def test_a_second_learn_begins_another_episode(goal):
 def test_an_episode_without_an_end_is_all_that_there_is():
     buffer = ReplayBuffer(5, spaces.Box(-1, 1, (1,)), spaces.Box(-1, 1, (1,)), device="cpu")
     for step in range(4):
-        buffer.add(*np.full((4, 1), step / 10), np.zeros(1), [{}])
+        buffer.add(np.array([step / 10]), np.array([(step + 1) / 10]), np.zeros(1), np.zeros(1), np.zeros(1), [{}])
     loaded = load_dataset(buffer)
     assert loaded.episode_lengths.tolist() == [4]
     assert not loaded.terminated[0]
@@ -443,9 +443,9 @@ def test_a_replay_buffers_images_stay_bytes():
     replay_buffer = DictReplayBuffer(10, space, spaces.Box(-1, 1, (1,)), device="cpu", handle_timeout_termination=True)
     space.seed(0)
     frames = [space.sample() for _ in range(4)]
-    for step, frame in enumerate(frames):
-        seen = {key: each[None] for key, each in frame.items()}
-        replay_buffer.add(seen, seen, np.zeros((1, 1)), np.ones(1), np.array([step == 3]), [{}])
+    seen = [{key: each[None] for key, each in frame.items()} for frame in [*frames, frames[-1]]]
+    for step in range(4):
+        replay_buffer.add(seen[step], seen[step + 1], np.zeros((1, 1)), np.ones(1), np.array([step == 3]), [{}])
     buffer = load_dataset(replay_buffer)
     np.testing.assert_array_equal(buffer.own("camera").numpy(), [frame["camera"] for frame in frames])
     np.testing.assert_array_equal(buffer.observations.numpy(), [frame["gripper"] for frame in frames])
