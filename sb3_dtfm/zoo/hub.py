@@ -16,7 +16,7 @@ from huggingface_sb3 import EnvironmentName, ModelName, ModelRepoId
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.files import replacing
-from sb3_dtfm.zoo.arguments import WRAPPER, UsageError
+from sb3_dtfm.zoo.arguments import WRAPPER, UsageError, check_algorithm
 
 CARD, SETTINGS, RESULTS, VIDEO = "README.md", "settings.json", "results.json", "replay.mp4"
 LARGEST_SETTINGS = 1_000_000  # bytes
@@ -234,8 +234,9 @@ def add_repository_arguments(parser: argparse.ArgumentParser) -> None:
 def repository_id(options: argparse.Namespace) -> str:
     """
     :param options: with the arguments of :func:`add_repository_arguments`, algo and env
-    :raises UsageError: an algorithm whose files are pickles
+    :raises UsageError: an unknown algorithm, or one whose files are pickles
     """
+    check_algorithm(options.algo)
     if options.algo not in ALGORITHMS:
         raise UsageError(
             f"--algo {options.algo}: accepted are {' and '.join(ALGORITHMS)}. RL-Zoo's load_from_hub "

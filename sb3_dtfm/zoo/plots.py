@@ -10,7 +10,7 @@ from matplotlib import pyplot as plt
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.zoo import commands
-from sb3_dtfm.zoo.arguments import UsageError
+from sb3_dtfm.zoo.arguments import UsageError, check_algorithm
 
 ONE_RUN = (
     "plot_from_file draws nothing of which there is one run alone: train another one, or leave it out with --skip-keys."
@@ -27,7 +27,7 @@ def draw(name: str, arguments: Sequence[str]) -> list[Path]:
     :param name: plot_train, all_plots or plot_from_file
     :param arguments: of the script, and `--figures`
     :return: the files, none where windows were shown
-    :raises UsageError: training episodes are asked for of an algorithm that has none
+    :raises UsageError: training episodes are asked for of an algorithm that is unknown or has none
     """
     folder, others = _folder(arguments)
     if name == "plot_train":
@@ -63,6 +63,8 @@ def _check_that_it_acts_while_it_learns(arguments: Sequence[str]) -> None:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("-a", "--algo")
     algo = parser.parse_known_args(arguments)[0].algo
+    if algo is not None:
+        check_algorithm(algo)
     if algo in ALGORITHMS:
         raise UsageError(
             f"--algo {algo}: it learns from recorded episodes, so there are no episodes of its training to draw; "

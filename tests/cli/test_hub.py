@@ -147,6 +147,8 @@ def test_a_model_that_holds_pickles_is_refused(repository, capsys):
     [
         (["pull", *MODEL, "--repo-folder", "nowhere"], "nowhere/settings.json does not exist; expected a repository"),
         (["pull", *MODEL, "--algo", "sac"], "--algo sac: accepted are dt and dtfm. RL-Zoo's load_from_hub downloads"),
+        (["pull", *MODEL, "--algo", "DT"], "--algo DT (did you mean dt?)"),
+        (["push", *MODEL, "--algo", "DT"], "--algo DT (did you mean dt?)"),
         (["push", *MODEL], "The logs/dt folder was not found"),
         (["pull", *MODEL, "--exp-id", "3"], "--exp-id 3: logs/dt/HalfCheetah-v5_3 exists already"),
     ],

@@ -97,6 +97,7 @@ def test_agents_of_rl_zoo_are_filmed_too(workplace):
     ("arguments", "message"),
     [
         (["--load-best"], "No model found for dtfm on HalfCheetah-v5, path: logs/dtfm/HalfCheetah-v5_10/best_model.zip"),
+        (["--algo", "DTFM"], "--algo DTFM (did you mean dtfm?)"),
         (["--exp-id", "7"], "The logs/dtfm/HalfCheetah-v5_7 folder was not found"),
         (["--gym-packages", "no_such_tasks"], "--gym-packages no_such_tasks"),
     ],

@@ -69,6 +69,7 @@ def test_without_a_screen_the_figures_are_files(figures, monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["plot_train", "-a", "DTFM", *RUNS], "--algo DTFM (did you mean dtfm?)"),
         (["plot_train", "-a", "dtfm", *RUNS], "there are no episodes of its training to draw; `sb3-dtfm plot RUN`"),
         (["plot_from_file", "-i", "one.pkl"], "draws nothing of which there is one run alone"),
         (["all_plots", "-a", "tqc", *RUNS], "nothing to draw in the folders of these algorithms and tasks"),
