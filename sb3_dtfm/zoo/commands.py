@@ -19,8 +19,10 @@ from huggingface_sb3 import EnvironmentName
 from rl_zoo3.utils import create_test_env, get_model_path
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.data import check_controller
 from sb3_dtfm.files import holds_pickles, read_configuration, settings_loader
+from sb3_dtfm.finetuning import FINETUNED
 from sb3_dtfm.zoo.arguments import Restored, StoreLiterals, StoreValues
 from sb3_dtfm.zoo.comparison import EpisodesOf, compare
 from sb3_dtfm.zoo.finetuning import FinetunedManager, OnlineManager
@@ -101,16 +103,16 @@ def enjoy(arguments: Sequence[str], target_return: float | None = None) -> None:
     :param target_return: environment reward units; None as in the model's run
     :raises FileNotFoundError: no such run, or no such model in it
     """
-    found: list[tuple[FoundModel, EnvironmentName]] = []
+    found: list[tuple[FoundModel, str, EnvironmentName]] = []
     envs: list[EpisodesOf] = []
     asked: list[float] = []
 
     def find(exp_id: int, folder: str, algo: str, env_name: EnvironmentName, *args: Any) -> FoundModel:
-        found.append((find_model(exp_id, folder, algo, env_name, *args), env_name))
+        found.append((find_model(exp_id, folder, algo, env_name, *args), algo, env_name))
         return found[-1][0]
 
     def make(*args: Any, **kwargs: Any) -> EpisodesOf:
-        envs.append(EpisodesOf(_without_pickles(found[-1][0], *args, **kwargs)))
+        envs.append(EpisodesOf(_without_pickles(*found[-1][:2], *args, **kwargs)))
         if target_return is not None:
             envs[-1].env_method("set_target_return", target_return)
         if not holds_pickles(found[-1][0].path):  # those of RL-Zoo's own algorithms
@@ -120,7 +122,7 @@ def enjoy(arguments: Sequence[str], target_return: float | None = None) -> None:
     script: Any = rl_zoo3.enjoy
     script.get_model_path, script.create_test_env, script.StoreDict = find, make, StoreValues
     _call(script.enjoy, "enjoy", arguments)
-    model, env_name = found[-1]
+    model, _, env_name = found[-1]
     if asked:
         attributes = {**read_configuration(model.path)["attributes"], "target_return": asked[-1]}
         for sentence in compare(attributes, envs[-1].returns, envs[-1].successes, Path(model.run), env_name):
@@ -134,18 +136,20 @@ def record_video(model: FoundModel, arguments: Sequence[str]) -> None:
     :param model: to act
     :param arguments: of RL-Zoo's `record_video`, but for those that choose a model
     """
-    make = functools.partial(_without_pickles, model)
+    make = functools.partial(_without_pickles, model, arguments[list(arguments).index("--algo") + 1])
     with mock.patch.multiple(rl_zoo3.utils, get_model_path=lambda *_: model, create_test_env=make, StoreDict=StoreValues):
         _call(lambda: runpy.run_module("rl_zoo3.record_video", run_name="__main__"), "video", arguments)
 
 
-def _without_pickles(model: FoundModel, *args: Any, **kwargs: Any) -> VecEnv:
+def _without_pickles(model: FoundModel, algo: str, *args: Any, **kwargs: Any) -> VecEnv:
     """
-    Call RL-Zoo's `create_test_env`; VecNormalize's pickled statistics are loaded only beside a model that is a pickle, too.
+    Call RL-Zoo's `create_test_env`; VecNormalize's pickled statistics are loaded only for an algorithm whose models are
+    pickles, too.
 
     :raises DatasetError: an action does something else there than in the data of the model
+    :raises ModelFileError: a model of dt or dtfm that is a pickle
     """
-    if holds_pickles(model.path):
+    if algo not in (*ALGORITHMS, FINETUNED):
         return create_test_env(*args, **kwargs)
     env = create_test_env(*args, **{**kwargs, "stats_path": None})
     check_controller(read_configuration(model.path)["attributes"].get("controller"), env.get_attr("env_args", [0])[0])

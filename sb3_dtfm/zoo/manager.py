@@ -25,7 +25,7 @@ from sb3_dtfm.algorithms.model import POLICY_NAMES
 from sb3_dtfm.arguments import COUNT, Number, with_nearest
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd, SeedEvaluations
 from sb3_dtfm.distributed import is_first_process
-from sb3_dtfm.files import CLASSES
+from sb3_dtfm.files import CLASSES, EVALUATED, check_settings
 from sb3_dtfm.zoo.arguments import (
     Restored,
     UsageError,
@@ -89,6 +89,8 @@ class OfflineExperimentManager(ExperimentManager):
         self.trial_id = None if self.trial_id is None else TrialNumber(self.trial_id)
         if resumed is not None and self.algo not in ALGORITHMS:  # whose checkpoints are pickles
             raise UsageError(f"--resume {resumed}: runs of {' and '.join(ALGORITHMS)} go on, none of --algo {self.algo}.")
+        if resumed is not None and self.optimize_hyperparameters:
+            raise UsageError(f"--resume {resumed}: a search is no run; -optimize with its --storage continues it.")
         if restored is not None:
             restored.check_config(self.config)
         self.valueless: list[str] = []  # why trials of a search have no value
@@ -124,6 +126,14 @@ class OfflineExperimentManager(ExperimentManager):
         missing = [option for option, value in study.items() if value is None]
         if not self.optimize_hyperparameters and 0 < len(missing) < len(study):
             raise UsageError(f"{', '.join(missing)}: needed, too, to train with a trial of a study; -optimize makes one.")
+
+    def load_trial(self, storage: str, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        """
+        Load a trial's settings as RL-Zoo does; whoever wrote the study runs nothing by them.
+
+        :raises ValueError: a class that is not known here, or Python that is no literal
+        """
+        return check_settings(super().load_trial(storage, *args, **kwargs), storage, [*CLASSES, *EVALUATED])
 
     def _check_settings(self, hyperparams: dict[str, Any]) -> None:
         """

@@ -1,25 +1,41 @@
-"""A run's folder is data: code that somebody planted in one runs in no command but where SECURITY.md says so."""
+"""Planted code, in the folder of a run, a file or an argument, runs where SECURITY.md says so and nowhere else."""
 
 import contextlib
 import json
 import pickle
 import shutil
+import subprocess
 import sys
 from collections import OrderedDict
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
+import optuna
 import pytest
 import yaml
-from stable_baselines3 import PPO
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+from stable_baselines3 import PPO, SAC
 
 from sb3_dtfm.cli.main import main
 from sb3_dtfm.files import literal, read_run
+from sb3_dtfm.zoo.manager import TrainingError
+from sb3_dtfm.zoo.registration import packaged_config
 from sb3_dtfm.zoo.resuming import START
 from tests.recorded import DATASET_ID, tiny_training
 
 ENV = ["--env", "HalfCheetah-v5"]
 RUN = Path("logs/dtfm/HalfCheetah-v5_1")
 PLANTED = "planted_module"
+CODE = "__import__('os').mkdir('ran') or 1 / 0"  # which ends a command
+PPO_RUN, NORMALIZED_RUN = Path("logs/ppo/Pendulum-v1_1"), Path("logs/ppo/Pendulum-v1_2")
+SAC_RUN = Path("logs/sac/Pendulum-v1_1")
+# Settings that RL-Zoo evaluates or imports.
+SETTINGS = {
+    **dict.fromkeys(("policy_kwargs", "normalize", "monitor_kwargs", "replay_buffer_class", "replay_buffer_kwargs"), CODE),
+    **dict.fromkeys(("policy", "callback", "env_wrapper", "vec_env_wrapper"), f"{PLANTED}.Absent"),
+}
 COMMANDS = {
     "enjoy": ["enjoy", "--algo", "dtfm", *ENV, "--no-render", "-n", "5"],
     "video": ["video", "--algo", "dtfm", *ENV, "-n", "2"],
@@ -73,7 +89,49 @@ def trained(tmp_path_factory, minari_folder) -> Path:
         patch.chdir(folder)
         patch.setenv("MINARI_DATASETS_PATH", str(minari_folder))
         assert main(tiny_training("dtfm", "--dataset", DATASET_ID, "--eval-freq", "-1")) == 0
+        _plant()
     return folder
+
+
+def _plant() -> None:
+    """Agents, statistics, data, settings and a study that hold code, beside the run."""
+    pickled = pickle.dumps(Run())
+    small = dict(env="Pendulum-v1", device="cpu", policy_kwargs={"net_arch": [4]})
+    PPO_RUN.mkdir(parents=True)
+    agent = PPO("MlpPolicy", n_steps=8, batch_size=8, **small)
+    agent.save(NORMALIZED_RUN / "Pendulum-v1.zip")
+    for task in ("Pendulum-v1", "HalfCheetah-v5"):
+        (NORMALIZED_RUN / task).mkdir()
+        (NORMALIZED_RUN / task / "config.yml").write_text("normalize: true\n")
+        (NORMALIZED_RUN / task / "args.yml").write_text("env_kwargs: null\n")
+        (NORMALIZED_RUN / task / "vecnormalize.pkl").write_bytes(pickled)
+    agent.planted = Run()
+    agent.save(PPO_RUN / "Pendulum-v1.zip")
+    SAC("MlpPolicy", buffer_size=9, **small).save(SAC_RUN / "Pendulum-v1.zip")
+    (SAC_RUN / "replay_buffer.pkl").write_bytes(pickled)
+    Path("evil.pkl").write_bytes(pickled)
+    Path("repository").mkdir()
+    settings = {"algo": "dtfm", "env": "HalfCheetah-v5", "target_return": 1.0, "env_kwargs": {}}
+    Path("repository/settings.json").write_text(json.dumps(settings))
+    shutil.copy(PPO_RUN / "Pendulum-v1.zip", "repository/dtfm-HalfCheetah-v5.zip")
+    np.savez("evil.npz", observations=np.array([Run()], dtype=object))
+    flat = {"observations": (9, 17), "actions": (9, 6), "rewards": 9, "terminals": 9}
+    np.savez("flat.npz", **{name: np.zeros(shape, np.float32) for name, shape in flat.items()}, timeouts=np.arange(9) == 8)
+    Path("plotted").mkdir()
+    np.savez("plotted/evaluations.npz", timesteps=np.array([Run()], dtype=object), results=np.zeros((1, 1)))
+    Path("evil.py").write_text(f"{CODE}\nhyperparams = {{}}\n")
+    Path("optunahub.py").write_text(f"{CODE}\n")  # which downloads and runs samplers
+    Path(f"{PLANTED}.py").write_text(
+        "import os\nimport gymnasium\nos.mkdir('ran')\nclass Wrapper(gymnasium.Wrapper): pass\n"
+    )
+    entries = {"packages": {"gym_packages": [PLANTED]}, "pickled": {"dataset_kwargs": {"allow_pickle": True}}}
+    for name, entry in entries.items():
+        Path(f"{name}.yml").write_text(yaml.safe_dump({"HalfCheetah-v5": {"dataset": "evil.pkl", **entry}}))
+    study = optuna.create_study(storage=JournalStorage(JournalFileBackend("study.log")), study_name="s")
+    for name, value in SETTINGS.items():
+        Path(f"{name}.yml").write_text(yaml.safe_dump({"default": {"n_timesteps": 8, "policy": "MlpPolicy", name: value}}))
+        choices = {name: optuna.distributions.CategoricalDistribution([value])}
+        study.add_trial(optuna.trial.create_trial(params={name: value}, distributions=choices, value=0.0))
 
 
 @pytest.fixture
@@ -81,12 +139,9 @@ def planted(trained, tmp_path, monkeypatch, minari_folder) -> Path:
     """A current folder with a run, and with a module that makes a folder where it is imported."""
     shutil.copytree(minari_folder, tmp_path / "minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    shutil.copytree(trained / "logs", tmp_path / "logs")
+    shutil.copytree(trained, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    Path(f"{PLANTED}.py").write_text(
-        "import os\nimport gymnasium\nos.mkdir('ran')\nclass Wrapper(gymnasium.Wrapper): pass\n"
-    )
     yield RUN / "HalfCheetah-v5"
     sys.modules.pop(PLANTED, None)
 
@@ -147,7 +202,7 @@ def test_anything_else_is_not(text):
         literal(text)
 
 
-CODE = "__import__('os').mkdir('ran')"
+PACKAGED = ["--conf-file", str(packaged_config("dtfm"))]
 OF_START = {
     "-params": (["-params", f"a:{CODE}"], "-params a:__import__"),
     "an abbreviation": (["--hyperp", f"a:{CODE}"], "a:__import__"),
@@ -165,6 +220,12 @@ OF_START = {
     "settings in Python": (["--conf-file", "logs/evil.py"], "--conf-file logs/evil.py"),
     "settings in a package": (["-conf", PLANTED], f"--conf-file {PLANTED}"),
     "settings in YAML": (["--conf-file", "logs/evil.yml"], "--conf-file logs/evil.yml"),
+    "a study": (
+        [*PACKAGED, "--storage", "study.log", "--study-name", "s", "--trial-id", "1"],
+        "study.log: normalize: expected",
+    ),
+    "a search": ([*PACKAGED, "--optimize"], "-optimize"),
+    "a module's task": (["--env", f"{PLANTED}:HalfCheetah-v5"], "not found in gym registry"),
     "another algorithm": (["--algo", "ppo"], "none of --algo ppo"),
 }
 
@@ -192,51 +253,231 @@ def test_a_damaged_start_is_named(start, planted, capsys):
     assert "start.json is damaged" in capsys.readouterr().err
 
 
-# Code that still runs, as SECURITY.md lists it, by command: the user's own arguments, and pickles.
-PPO_ENV = ["--algo", "ppo", "--env", "Pendulum-v1"]
-PPO_RUN = Path("logs/ppo/Pendulum-v1_1")
+# Code that still runs, as SECURITY.md lists it, by command and option. Commands end early: behind a package that is imported
+# an absent one follows.
+PENDULUM = ["--env", "Pendulum-v1"]
+DTFM_TRAINING = ["train", "--algo", "dtfm", *ENV, "-n", "1", "--eval-freq", "-1"]
+FINETUNE = ["finetune", "--model", str(RUN), *ENV, "-n", "8"]
+BENCHMARK = ["benchmark", "--dataset", f"HalfCheetah-v5={DATASET_ID}", "--algo", "dt", "--fractions", "1"]
+COMMANDS_WITH_PACKAGES = {
+    **COMMANDS,
+    "train": ["train", "--algo", "dtfm", *ENV],
+    "benchmark": ["benchmark"],
+    "inspect": ["inspect", "absent.npz"],
+}
+AGENT = [str(PPO_RUN / "Pendulum-v1.zip"), "-n", "8"]
 STILL_RUNS = {
-    "train -params": tiny_training("dtfm", f"a:{CODE}"),
-    "train --env-kwargs": tiny_training("dtfm", "--env-kwargs", f"a:{CODE}"),
-    "train --conf-file YAML": ["train", *PPO_ENV, "--conf-file", "evil.yml"],
-    "train --conf-file Python": ["train", *PPO_ENV, "--conf-file", "evil.py"],
-    "enjoy --gym-packages": [*COMMANDS["enjoy"], "--gym-packages", PLANTED],
-    "train, statistics in the current folder": ["train", *PPO_ENV, "-n", "8", "--eval-freq", "-1"],
-    "train -i": ["train", *PPO_ENV, "-i", str(PPO_RUN / "Pendulum-v1.zip"), "-n", "8"],
-    "finetune -i": [
-        "finetune",
-        "--model",
-        str(RUN),
-        *ENV,
-        "--algo",
-        "ppo",
-        "-i",
-        str(PPO_RUN / "Pendulum-v1.zip"),
-        "-n",
-        "8",
-    ],
-    "enjoy --env-kwargs": [*COMMANDS["enjoy"], "--env-kwargs", f"a:{CODE}"],
-    "enjoy, an agent": ["enjoy", *PPO_ENV, "-f", "logs", "--no-render", "-n", "2"],
-    "video, an agent": ["video", *PPO_ENV, "-n", "2"],
-    "record --gym-packages": [*COMMANDS["record"], "--gym-packages", PLANTED],
-    "record, an agent": ["record", *PPO_ENV, "--model", str(PPO_RUN), "--episodes", "1", "--dataset-id", "tests/ran-v0"],
-    "sweep --acting": [*COMMANDS["sweep"], "--acting", f"a:{CODE}"],
+    "train -params": ["train", "--algo", "dtfm", "-params", f"a:{CODE}"],
+    "train --env-kwargs": ["train", "--algo", "ppo", *PENDULUM, "--env-kwargs", f"a:{CODE}"],
+    "train --eval-env-kwargs": ["train", "--algo", "ppo", *PENDULUM, "--eval-env-kwargs", f"a:{CODE}"],
+    "finetune -params": [*FINETUNE, "-params", f"a:{CODE}"],
+    "finetune --env-kwargs": [*FINETUNE, "--env-kwargs", f"a:{CODE}"],
+    "finetune --eval-env-kwargs": [*FINETUNE, "--eval-env-kwargs", f"a:{CODE}"],
     "benchmark -params": ["benchmark", "--label", "x", "-params", f"a:{CODE}"],
-    "plot plot_from_file": ["plot", "plot_from_file", "-i", "results.pkl"],
+    "benchmark --env-kwargs": ["benchmark", "--env-kwargs", f"a:{CODE}"],
+    "enjoy --env-kwargs": [*COMMANDS["enjoy"], "--env-kwargs", f"a:{CODE}"],
+    "video --env-kwargs": [*COMMANDS["video"], "--env-kwargs", f"a:{CODE}"],
+    "sweep --env-kwargs": [*COMMANDS["sweep"], "--env-kwargs", f"a:{CODE}"],
+    "sweep --acting": [*COMMANDS["sweep"], "--acting", f"a:{CODE}"],
+    "sweep --dataset-kwargs": [*COMMANDS["sweep"], "--dataset-kwargs", f"a:{CODE}"],
+    **{
+        f"{command} --gym-packages": [*arguments, "--gym-packages", PLANTED, "absent_module"]
+        for command, arguments in COMMANDS_WITH_PACKAGES.items()
+    },
+    "benchmark --datasets, gym_packages": ["benchmark", "--datasets", "packages.yml"],
+    **{
+        f"{command} --env MODULE:ID": [*arguments, "--env", f"{PLANTED}:HalfCheetah-v5"]
+        for command, arguments in COMMANDS.items()
+        if command in ("push", "record")
+    },
+    "sweep --env MODULE:ID": [*COMMANDS["sweep"], "--dataset", "flat.npz", "--env", f"{PLANTED}:HalfCheetah-v5"],
+    "inspect --env MODULE:ID": ["inspect", DATASET_ID, "--env", f"{PLANTED}:HalfCheetah-v5"],
+    "record --env-wrapper": [*COMMANDS["record"], "--env-wrapper", f"{PLANTED}.Absent"],
+    **{f"train --conf-file, {key}": ["train", "--algo", "ppo", *PENDULUM, "--conf-file", f"{key}.yml"] for key in SETTINGS},
+    "train --conf-file FILE.py": ["train", "--algo", "ppo", *PENDULUM, "--conf-file", "evil.py"],
+    "train --conf-file PACKAGE": ["train", "--algo", "ppo", *PENDULUM, "--conf-file", PLANTED],
+    **{
+        f"finetune --conf-file, {key}": [*FINETUNE, "--algo", "ppo", "--conf-file", f"{key}.yml"]
+        for key in SETTINGS
+        if key != "vec_env_wrapper"
+    },
+    "finetune --conf-file FILE.py": [*FINETUNE, "--conf-file", "evil.py"],
+    **{
+        f"benchmark --profile, {key}": [*BENCHMARK, "--profile", f"{key}.yml"]
+        for key in ("normalize", "policy", "callback", "env_wrapper", "vec_env_wrapper")
+    },
+    "train --sampler auto": [*DTFM_TRAINING, "--dataset", DATASET_ID, "-optimize", "--sampler", "auto"],
+    "train -i": ["train", "--algo", "ppo", *PENDULUM, "-i", *AGENT],
+    "train -i, statistics": ["train", "--algo", "ppo", *PENDULUM, "-i", str(NORMALIZED_RUN / "Pendulum-v1.zip"), "-n", "8"],
+    "train -i, replay buffer": ["train", "--algo", "sac", *PENDULUM, "-i", str(SAC_RUN / "Pendulum-v1.zip"), "-n", "1"],
+    "finetune -i": [*FINETUNE, "--algo", "ppo", "-i", *AGENT],
+    "finetune -i, statistics": [*FINETUNE, "--algo", "ppo", "-i", str(NORMALIZED_RUN / "Pendulum-v1.zip")],
+    "train, statistics in the current folder": ["train", "--algo", "ppo", *PENDULUM, "-n", "8", "--eval-freq", "-1"],
+    "finetune, statistics in the current folder": [*FINETUNE, "--algo", "ppo"],
+    "enjoy, an agent": ["enjoy", "--algo", "ppo", *PENDULUM, "-f", "logs", "--exp-id", "1", "--no-render", "-n", "2"],
+    "video, an agent": ["video", "--algo", "ppo", *PENDULUM, "--exp-id", "1", "-n", "2"],
+    "record, an agent": [*COMMANDS["record"], "--algo", "ppo", *PENDULUM, "--model", str(PPO_RUN)],
+    "enjoy, statistics": ["enjoy", "--algo", "ppo", *PENDULUM, "-f", "logs", "--exp-id", "2", "--no-render", "-n", "2"],
+    "video, statistics": ["video", "--algo", "ppo", *PENDULUM, "--exp-id", "2", "-n", "2"],
+    "record, statistics": [*COMMANDS["record"], "--algo", "ppo", *PENDULUM, "--model", str(NORMALIZED_RUN)],
+    "record --vec-normalize": [*COMMANDS["record"], "--vec-normalize", "evil.pkl"],
+    "plot plot_from_file -i": ["plot", "plot_from_file", "-i", "evil.pkl"],
+    "plot plot_from_file --merge": ["plot", "plot_from_file", "-i", "results.pkl", "--merge", "evil.pkl"],
+    "inspect --dataset-kwargs, a pickle": ["inspect", "evil.pkl", "--dataset-kwargs", "allow_pickle:True"],
+    "inspect --dataset-kwargs, arrays": ["inspect", "evil.npz", "--dataset-kwargs", "allow_pickle:True"],
+    "sweep --dataset-kwargs, a pickle": [
+        *COMMANDS["sweep"],
+        "--dataset",
+        "evil.pkl",
+        "--dataset-kwargs",
+        "allow_pickle:True",
+    ],
+    "sweep --dataset-kwargs, arrays": [*COMMANDS["sweep"], "--dataset", "evil.npz", "--dataset-kwargs", "allow_pickle:True"],
 }
 
 
+class HereInstead:
+    """A process of the benchmark, as far as it needs one, whose command runs in this process."""
+
+    def __init__(self, command: list[str], **_):
+        self.stdout, self.returncode = iter(()), 1
+        with contextlib.suppress(Exception, SystemExit):
+            main(command[command.index("train") :])
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def poll(self) -> int:
+        return self.returncode
+
+
 @pytest.mark.parametrize("what", STILL_RUNS)
-def test_what_security_lists_does_run(what, planted):
-    Path("evil.py").write_text(f"{CODE}\nhyperparams = {{}}\n")
-    Path("evil.yml").write_text(f'default: {{policy_kwargs: "{CODE}", n_timesteps: 8, policy: MlpPolicy}}\n')
-    Path("results.pkl").write_bytes(pickle.dumps(Run()))
-    Path("Pendulum-v1").mkdir()
+def test_what_security_lists_does_run(what, planted, monkeypatch):
+    results = {"results_table": {"headers": ["a"], "value_matrix": [[1]]}}
+    Path("results.pkl").write_bytes(pickle.dumps(results))
     if "current folder" in what:
-        Path("Pendulum-v1/vecnormalize.pkl").write_bytes(pickle.dumps(Run()))
-    agent = PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8, device="cpu")
-    agent.planted = Run()
-    agent.save(PPO_RUN / "Pendulum-v1.zip")
+        for task in ("Pendulum-v1", "HalfCheetah-v5"):
+            Path(task).mkdir()
+            Path(task, "vecnormalize.pkl").write_bytes(pickle.dumps(Run()))
+    processes = SimpleNamespace(**{**vars(subprocess), "Popen": HereInstead})
+    monkeypatch.setattr("sb3_dtfm.benchmark.runner.subprocess", processes)
     with contextlib.suppress(Exception, SystemExit):  # what comes of it is no agent
         main(STILL_RUNS[what])
     assert Path("ran").exists()
+
+
+# Options that read data, models and literals: with what their error says.
+TRIALS = {name: number for number, name in enumerate(SETTINGS)}
+RUNS_NOTHING = {
+    "inspect --dataset-kwargs": (["inspect", DATASET_ID, "--dataset-kwargs", f"a:{CODE}"], "is no key:value"),
+    "inspect --env-kwargs": (["inspect", DATASET_ID, *ENV, "--env-kwargs", f"a:{CODE}"], "is no key:value"),
+    "record --env-kwargs": ([*COMMANDS["record"], "--env-kwargs", f"a:{CODE}"], "is no key:value"),
+    "export --acting": (["export", str(RUN), "--acting", f"a:{CODE}"], "is no key:value"),
+    "inspect, a pickle": (["inspect", "evil.pkl"], "evil.pkl"),
+    "inspect, arrays": (["inspect", "evil.npz"], "evil.npz"),
+    "sweep, a pickle": ([*COMMANDS["sweep"], "--dataset", "evil.pkl"], "evil.pkl"),
+    "sweep, arrays": ([*COMMANDS["sweep"], "--dataset", "evil.npz"], "evil.npz"),
+    "train, a pickle": ([*DTFM_TRAINING, "--dataset", "evil.pkl"], "evil.pkl"),
+    "train, arrays": ([*DTFM_TRAINING, "--dataset", "evil.npz"], "evil.npz"),
+    "train, a pickle that is allowed": (
+        [*DTFM_TRAINING, "--dataset", "evil.pkl", "-params", "dataset_kwargs:{'allow_pickle':True}"],
+        "allow_pickle is accepted by load_dataset alone",
+    ),
+    "finetune, a pickle that is allowed": (
+        [*COMMANDS["finetune"], "-params", "dataset:'evil.pkl'", "dataset_kwargs:{'allow_pickle':True}"],
+        "allow_pickle is accepted by load_dataset alone",
+    ),
+    "benchmark, a pickle": (["benchmark", "--dataset", "HalfCheetah-v5=evil.pkl"], "evil.pkl"),
+    "benchmark, a pickle that is allowed": (["benchmark", "--datasets", "pickled.yml"], "allow_pickle is accepted by"),
+    "train --env MODULE:ID": ([*DTFM_TRAINING, "--env", f"{PLANTED}:HalfCheetah-v5"], "not found in gym registry"),
+    "finetune --env MODULE:ID": (
+        [*COMMANDS["finetune"], "--env", f"{PLANTED}:HalfCheetah-v5"],
+        "not found in gym registry",
+    ),
+    **{
+        f"{command} --env MODULE:ID": ([*COMMANDS[command], "--env", f"{PLANTED}:HalfCheetah-v5"], f"KeyError('{PLANTED}:")
+        for command in ("enjoy", "video")
+    },
+    "benchmark --env MODULE:ID": (["benchmark", "--env", f"{PLANTED}:HalfCheetah-v5"], "planted_module"),
+    "finetune --conf-file, vec_env_wrapper": (
+        [*FINETUNE, "--algo", "ppo", "--conf-file", "vec_env_wrapper.yml"],
+        "expected sb3_dtfm.finetuning.NoiseActionVecEnv or",
+    ),
+    "benchmark --profile FILE.py": ([*BENCHMARK, "--profile", "evil.py"], "expected a mapping by task"),
+    **{
+        f"benchmark --profile, {key}": ([*BENCHMARK, "--profile", f"{key}.yml"], key)
+        for key in ("policy_kwargs", "monitor_kwargs", "replay_buffer_class", "replay_buffer_kwargs")
+    },
+    **{
+        f"train --storage, {name}": (
+            [
+                *DTFM_TRAINING,
+                "--dataset",
+                DATASET_ID,
+                "--storage",
+                "study.log",
+                "--study-name",
+                "s",
+                "--trial-id",
+                str(trial),
+            ],
+            f"study.log: {name}",
+        )
+        for name, trial in TRIALS.items()
+    },
+    "train -i of dtfm, an agent": (
+        [*DTFM_TRAINING, "--dataset", DATASET_ID, "-i", str(PPO_RUN / "Pendulum-v1.zip")],
+        "saved by another algorithm",
+    ),
+    "finetune --model, an agent": (
+        [*COMMANDS["finetune"], "--model", str(PPO_RUN / "Pendulum-v1.zip")],
+        "saved by another algorithm",
+    ),
+    "export, an agent": (["export", str(PPO_RUN / "Pendulum-v1.zip")], "saved by another algorithm"),
+    "pull, an agent": (
+        ["pull", "--algo", "dtfm", *ENV, "-orga", "me", "--repo-folder", "repository"],
+        "saved by another algorithm",
+    ),
+    "plot, arrays": (["plot", "plotted"], "allow_pickle=False"),
+    "report --baseline, arrays": (["report", "results", "--baseline", "a=plotted/evaluations.npz"], ""),
+}
+
+
+@pytest.mark.parametrize("what", RUNS_NOTHING)
+def test_other_options_run_nothing(what, planted, capsys):
+    arguments, message = RUNS_NOTHING[what]
+    raised = ""
+    try:
+        assert main(arguments) == 2
+    except (SystemExit, KeyError, TrainingError) as error:
+        raised = repr(error)
+    assert message in capsys.readouterr().err + raised
+    assert not Path("ran").exists()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_an_agent_in_the_place_of_a_model_of_ours_is_refused(command, planted, capsys):
+    """With pickled statistics beside it, which are not loaded either."""
+    shutil.copy(PPO_RUN / "Pendulum-v1.zip", RUN / "HalfCheetah-v5.zip")
+    settings = yaml.unsafe_load((planted / "config.yml").read_text())
+    (planted / "config.yml").write_text(yaml.dump({**settings, "normalize": True}))
+    (planted / "vecnormalize.pkl").write_bytes(pickle.dumps(Run()))
+    assert main(COMMANDS[command]) == 2
+    error = capsys.readouterr().err
+    assert "saved by another algorithm" in error or "was saved by PPO" in error
+    assert not Path("ran").exists()
+
+
+def test_pickles_beside_a_model_that_learns_further_are_not_loaded(planted, monkeypatch):
+    monkeypatch.setattr("sb3_dtfm.zoo.manager.OfflineExperimentManager.learn", lambda *_: None)
+    for name in ("replay_buffer.pkl", "HalfCheetah-v5/vecnormalize.pkl"):
+        (RUN / name).write_bytes(pickle.dumps(Run()))
+    arguments = ["--dataset", DATASET_ID, "-i", str(RUN / "HalfCheetah-v5.zip"), "-params", "normalize:True"]
+    with contextlib.suppress(AssertionError):  # RL-Zoo's, of an algorithm without a replay buffer
+        main([*DTFM_TRAINING, *arguments])
+    assert not Path("ran").exists()
+    assert main(COMMANDS["finetune"]) == 0
+    assert not Path("ran").exists()
