@@ -481,3 +481,44 @@ def test_pickles_beside_a_model_that_learns_further_are_not_loaded(planted, monk
     assert not Path("ran").exists()
     assert main(COMMANDS["finetune"]) == 0
     assert not Path("ran").exists()
+
+
+# In a file that others wrote: it clears a terminal.
+CLEAR = "a\x1b[2Jb"
+PRINTED = {
+    "start.json, command": ({"command": CLEAR}, "`sb3-dtfm a"),
+    "start.json, --gym-packages": ({"arguments": ["--algo", "dtfm", *ENV, "--gym-packages", CLEAR]}, "names the package a"),
+    "start.json, --conf-file": ({"arguments": ["--algo", "dtfm", *ENV, "--conf-file", CLEAR]}, "names the settings a"),
+    "start.json, --algo": ({"arguments": ["--algo", CLEAR, *ENV]}, "'a"),
+    "start.json, --env": ({"arguments": ["--algo", "dtfm", "--env", CLEAR]}, "a"),
+    "start.json, -params": ({"arguments": ["--algo", "dtfm", *ENV, "-params", f"{CLEAR}:1"]}, "-params a"),
+}
+
+
+@pytest.mark.parametrize("what", PRINTED)
+def test_what_started_a_run_controls_no_terminal(what, planted, capfd):
+    start, message = PRINTED[what]
+    (RUN / START).write_text(json.dumps({"arguments": ["--algo", "dtfm", *ENV], **start}))
+    with contextlib.suppress(SystemExit):
+        main(["train", "--resume", str(RUN)])
+    printed = "".join(capfd.readouterr())
+    assert message in printed
+    assert "\x1b" not in printed
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_runs_yaml_controls_no_terminal(command, planted, capfd):
+    (planted / "config.yml").write_text(json.dumps({"env_wrapper": f"{CLEAR}.Wrapper"}))
+    assert main(COMMANDS[command]) == 2
+    printed = "".join(capfd.readouterr())
+    assert "config.yml" in printed
+    assert "\x1b" not in printed
+
+
+def test_settings_of_a_repository_control_no_terminal(planted, capfd):
+    settings = {"algo": "dtfm", "env": CLEAR, "target_return": 1.0, "env_kwargs": {}}
+    Path("repository/settings.json").write_text(json.dumps(settings))
+    assert main(["pull", "--algo", "dtfm", *ENV, "-orga", "me", "--repo-folder", "repository"]) == 2
+    printed = "".join(capfd.readouterr())
+    assert "holds a model of dtfm for a" in printed
+    assert "\x1b" not in printed
