@@ -43,6 +43,19 @@ def test_metadata_have_the_projects_urls(released):
     assert (released / "sb3_dtfm" / "py.typed").is_file()
 
 
+def test_metadata_name_the_pythons_of_the_pages():
+    tomllib = pytest.importorskip("tomllib", reason="Python 3.11 reads TOML")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["requires-python"] == ">=3.10", "no cap that no dependency needs"
+    minors = re.findall(r"Python :: 3\.(\d+)", "\n".join(project["classifiers"]))
+    assert list(map(int, minors)) == list(range(10, int(minors[-1]) + 1))
+    for page in ("README.md", "docs/howto/install.md", "CHANGELOG.md"):
+        assert f"Python 3.10 to 3.{minors[-1]}" in (ROOT / page).read_text(), page
+    extras = project["optional-dependencies"]
+    assert "gymnasium[classic-control]" in extras["classic-control"][0], "which brings pygame"
+    assert set(re.findall(r"[\w-]+", extras["all"][0].split("[")[1])) == set(extras) - {"all", "dev"}
+
+
 @pytest.mark.parametrize("address", ["OWNER/sb3_dtfm", "http://github.com/OWNER/sb3_dtfm", "https://github.com"])
 def test_another_address_is_refused_before_anything_is_written(tmp_path, address):
     command = [sys.executable, str(SCRIPT), address, str(tmp_path / "release")]
