@@ -56,7 +56,7 @@ def files_below(folder: Path, part: str = "") -> list[Path]:
 
     :param folder: of a dataset; a snapshot of Hugging Face's hub may link to the hub's `blobs`
     :param part: what to look through, the whole folder if not given
-    :raises DatasetError: a link leads out of the folder, to anything on this machine
+    :raises DatasetError: a link leads out of the folder, to anything on this machine, or a pipe or device lies in it
     """
     root, files, seen = folder.resolve(), [], set()
     within = [root, *(parent.parents[1] / "blobs" for parent in (root, *root.parents) if parent.parent.name == "snapshots")]
@@ -77,6 +77,8 @@ def files_below(folder: Path, part: str = "") -> list[Path]:
     for file in files:
         if file.is_symlink():
             check(file)
+        if file.exists() and not file.is_file():  # to open a pipe can take for ever
+            raise DatasetError(f"{file} is no regular file; files and folders are accepted.")
     return sorted(file for file in files if file.is_file())
 
 

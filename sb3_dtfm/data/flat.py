@@ -276,7 +276,7 @@ def _actions(arrays: Arrays, keys: Sequence[str], space: ActionSpace | None) -> 
     numbers = isinstance(space, spaces.Box) or (arrays.are_columns and actions.dtype.kind == "f")
     if actions.ndim == 1 and (numbers or keys[0] not in ACTIONS):
         actions = actions[:, None]
-    if len(keys) > 1:
+    if len(keys) > 1 and len(actions):
         n_steps = len(actions)
         actions = np.concatenate([arrays.read((key,), n_steps).reshape(n_steps, -1) for key in keys], axis=1)
     check_shape(actions, space, arrays.source)
@@ -414,6 +414,8 @@ def _numbered(arrays: Arrays, n_steps: int) -> np.ndarray:
     numbers = np.asarray(arrays.stored(name)).reshape(-1)
     if numbers.shape != (n_steps,):
         raise DatasetError(f"{arrays.source}: {name} has {len(numbers)} entries; actions have {n_steps} steps.")
+    if not np.isfinite(numbers).all() if numbers.dtype.kind == "f" else None in numbers.tolist():
+        raise DatasetError(f"{arrays.source}: {name} is not given at each step; a number or a name is expected.")
     changes = np.flatnonzero(numbers[1:] != numbers[:-1]) + 1
     starts, counts = np.unique(numbers[np.append(0, changes)].astype(str), return_counts=True)
     if (counts > 1).any():

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sb3_dtfm.actions import ActionSpace
-from sb3_dtfm.arguments import COUNT, Number
+from sb3_dtfm.arguments import COUNT, POSITIVE, Number
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, files_below
 from sb3_dtfm.data.flat import bounded_space, fitted, json_options, warn_of_made_up_rewards
@@ -152,14 +152,18 @@ def _info(folder: Path, source: str) -> dict[str, Any]:
         (path,) = (path for path in files_below(folder, "meta") if path == folder / INFO)
         info: dict[str, Any] = json.loads(path.read_text())
         version = info.get("codebase_version")
-        if not re.fullmatch(r"v[23]\.\d+", str(version)):
+        if not re.fullmatch(r"v2\.[01]|v3\.0", str(version)):
             raise DatasetError(f"{source}: {INFO}: codebase_version is {version!r:.20}; formats v2.0 to v3.0 are read.")
         for name in ("total_frames", "total_episodes"):
             if not COUNT.accepts(info[name]):
                 raise DatasetError(f"{source}: {INFO}: {name} is {info[name]!r:.20}; {COUNT} is expected.")
+        if not POSITIVE.accepts(info.get("fps", 1)):
+            raise DatasetError(f"{source}: {INFO}: fps is {info['fps']!r:.20}; {POSITIVE} is expected.")
         for name, each in info["features"].items():
             if not isinstance(each["dtype"], str):
                 raise DatasetError(f"{source}: {INFO}: dtype of {name} is {each['dtype']!r:.20}; a word is expected.")
+            if not isinstance(each.get("shape", []), list):
+                raise DatasetError(f"{source}: {INFO}: shape of {name} is {each['shape']!r:.20}; a list is expected.")
         return info
 
 
@@ -202,9 +206,10 @@ def _check_labels(columns: dict[str, np.ndarray], labels: Sequence[str], reward:
             raise DatasetError(f"{source}: {name} has {columns[name].shape[1]} numbers a frame; one is expected.")
     for name in set(labels) - {reward, TIME}:
         check_flags(columns[name], len(columns[name]), f"{source}: {name}")
-    odd = columns[EPISODE] % 1 != 0
+    with np.errstate(invalid="ignore"):  # of infinity nothing is left
+        odd = (columns[EPISODE] % 1 != 0) | (columns[EPISODE] < 0)
     if odd.any():
-        raise DatasetError(f"{source}: {EPISODE} is {columns[EPISODE][odd][0]}; whole numbers are expected.")
+        raise DatasetError(f"{source}: {EPISODE} is {columns[EPISODE][odd][0]}; {EPISODE_NUMBER} is expected.")
 
 
 def _rewards(labels: dict[str, np.ndarray], reward: str, n_steps: int) -> tuple[np.ndarray, bool, bool | None]:
@@ -236,7 +241,7 @@ def _places(episodes: Any, numbers: np.ndarray, source: str) -> list[int]:
 
 def _recorded(actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Smallest and largest action of each dimension; 1 around one that never changes."""
-    finite = np.where(np.isfinite(actions), actions, 0.0)  # others are refused by their step
+    finite = np.where(np.abs(actions) <= np.finfo(np.float32).max, actions, 0.0)  # others are refused by their step
     low, high = finite.min(axis=0), finite.max(axis=0)
     still = low == high
     return low - still, high + still

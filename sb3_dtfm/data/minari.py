@@ -200,10 +200,11 @@ def read_metadata(folder: Path, dataset_id: str) -> dict[str, Any]:
 
     :param folder: of the dataset's data
     :param dataset_id: for messages
-    :raises DatasetError: names the field, what was found and what is accepted
+    :raises DatasetError: names the field, what was found and what is accepted; or a link that leads out of the folder
     """
     path = folder / METADATA_FILE_NAME
     source = f"Minari dataset {dataset_id} ({path})"
+    files_below(folder)  # no link leads out of it
     with wrap_dataset_errors(source):
         metadata = json.loads(existing_file(path, "what a Minari dataset says of itself").read_text())
     if not isinstance(metadata, dict):

@@ -17,7 +17,7 @@ from gymnasium import spaces
 
 from sb3_dtfm.actions import ActionSpace
 from sb3_dtfm.data.buffer import TrajectoryBuffer
-from sb3_dtfm.data.cache import Fingerprint, files_below
+from sb3_dtfm.data.cache import Fingerprint, existing_file, files_below
 from sb3_dtfm.data.flat import (
     ACTIONS,
     DONES,
@@ -70,10 +70,8 @@ def fingerprint_zarr(path: str | os.PathLike[str], options: dict[str, Any]) -> F
 
 
 def _existing(path: str | os.PathLike[str]) -> Path:
-    path = Path(path).expanduser()
-    if not path.exists():
-        raise DatasetError(f"{path}: does not exist; {EXPECTED} is expected.")
-    return path
+    folder = Path(path).expanduser()
+    return folder if folder.is_dir() else existing_file(path, EXPECTED)
 
 
 @contextlib.contextmanager
@@ -165,64 +163,65 @@ def load_zarr(
     with wrap_dataset_errors(source), _opened(path) as group:
         data = dict(group["data"].arrays())
         n_stored = path.stat().st_size if path.is_file() else sum(file.stat().st_size for file in files_below(path))
-        if ENDS not in group:
+        if not hasattr(group.get(ENDS), "shape"):
             raise DatasetError(f"{source}: has no {ENDS}, which says where episodes end.")
         for name, array in {**data, ENDS: group[ENDS]}.items():
             check_size(math.prod(array.shape) * array.dtype.itemsize, n_stored, f"{source}: {name}")
-        stored_ends = np.asarray(group[ENDS][:])
+        with wrap_dataset_errors(f"{source}: {ENDS}"):
+            stored_ends = np.asarray(group[ENDS][:])
         with np.errstate(invalid="ignore"):
             ends = stored_ends.astype(np.int64)
         name = _first(data, ACTIONS)
         if name is None:
             raise DatasetError(f"{source}: data has no array {' or '.join(ACTIONS)}, only {', '.join(sorted(data))}.")
-        n_steps = data[name].shape[0]
+        n_steps = next(iter(data[name].shape), 0)
         ascending = ends.ndim == 1 and len(ends) and (ends == stored_ends).all() and (np.diff(ends, prepend=0) > 0).all()
         if not ascending or ends[-1] != n_steps:
             raise DatasetError(
                 f"{source}: {ENDS} is {stored_ends}, expected ascending whole numbers of steps, the last one {n_steps}."
             )
         chosen = _chosen(data, observation_keys, n_steps, observation_space, source)
+        observed_arrays = sorted({array for array, _ in chosen.values()})
+        _check_lengths(data, observed_arrays, n_steps, source)
+        _warn_of_missing_chunks(data, [name, *observed_arrays], source)
         rewards = _first(data, REWARDS)
         if rewards is None:
-            observed_arrays = {array for array, _ in chosen.values()}
-            warn_of_made_up_rewards(set(data) - observed_arrays, source)
+            warn_of_made_up_rewards(set(data) - set(observed_arrays), source)
         elif data[rewards].shape not in ((n_steps,), (n_steps, 1)):
             raise DatasetError(f"{source}: {rewards} has shape {data[rewards].shape}, expected ({n_steps},).")
         # One number a step is a choice only where it can be.
         numbers = isinstance(action_space, spaces.Box) or data[name].dtype.kind == "f"
         alone = len(data[name].shape) == 1 and numbers and not isinstance(action_space, spaces.Discrete)
 
-        def actions_of(steps: slice) -> np.ndarray:
-            actions = np.asarray(data[name][steps])
+        def actions_of(steps: slice, where: str) -> np.ndarray:
+            actions = _steps(data, name, steps, where)
             return actions[:, None] if alone else actions
 
-        space = bounded_space(action_bounds, action_space, actions_of(slice(0, 1)), source)
+        space = bounded_space(action_bounds, action_space, actions_of(slice(0, 1), source), source)
 
         def trajectory(number: int) -> Trajectory:
-            steps, where = slice(int(ends[number - 1]) if number else 0, int(ends[number])), f"episode {number}"
-            entries = {each: _read(data[array], steps, columns, f"{source}, {where}: {array}") for each, (array, columns)
-                       in chosen.items()}  # fmt: skip
-            seen = observed(entries, list(entries), observation_space, f"{source}, {where}")
+            steps, episode = slice(int(ends[number - 1]) if number else 0, int(ends[number])), f"episode {number}"
+            where = f"{source}, {episode}"
+            entries = {each: _read(data, array, steps, columns, where) for each, (array, columns) in chosen.items()}
+            seen = observed(entries, list(entries), observation_space, where)
             length = steps.stop - steps.start
-            actions = fitted(actions_of(steps), space, clip_actions)
-            success = _success(data, steps, f"{source}, {where}")
+            actions = fitted(actions_of(steps, where), space, clip_actions)
+            success = _success(data, steps, where)
             if rewards is None:
                 done = success is not False
                 marks = done * np.eye(1, length, length - 1)[0]
                 return Trajectory(
-                    seen.vectors, actions, marks, terminated=done, success=success, name=where, images=seen.images
+                    seen.vectors, actions, marks, terminated=done, success=success, name=episode, images=seen.images
                 )
-            terminal, timeout, done = (
-                _ended(data, names, steps, f"{source}, {where}") for names in (TERMINATIONS, TRUNCATIONS, DONES)
-            )
+            terminal, timeout, done = (_ended(data, names, steps, where) for names in (TERMINATIONS, TRUNCATIONS, DONES))
             return Trajectory(
                 seen.vectors,
                 actions,
-                np.asarray(data[rewards][steps]).reshape(-1),
+                _steps(data, rewards, steps, where).reshape(-1),
                 terminated=terminal or (done and not timeout),
                 truncated=timeout,
                 success=success,
-                name=where,
+                name=episode,
                 images=seen.images,
             )
 
@@ -237,10 +236,36 @@ def _first(data: Mapping[str, Any], names: Sequence[str]) -> str | None:
     return next((name for name in names if name in data), None)
 
 
+def _steps(data: Mapping[str, Any], name: str, steps: slice, where: str) -> np.ndarray:
+    """Some steps of an array."""
+    with wrap_dataset_errors(f"{where}: {name}"):
+        return np.asarray(data[name][steps])
+
+
+def _check_lengths(data: Mapping[str, Any], observed_arrays: Sequence[str], n_steps: int, source: str) -> None:
+    """Refuse observations and flags of another number of steps."""
+    flags = (_first(data, names) for names in (TERMINATIONS, TRUNCATIONS, DONES, SUCCESSES))
+    for name in (*observed_arrays, *filter(None, flags)):
+        if data[name].shape[:1] != (n_steps,):
+            raise DatasetError(f"{source}: {name} has shape {data[name].shape}, expected {n_steps} steps.")
+
+
+def _warn_of_missing_chunks(data: Mapping[str, Any], names: Sequence[str], source: str) -> None:
+    """Zarr leaves out a chunk that holds its fill value alone, so that no reader can tell it from one that is lost."""
+    for name in names:
+        with wrap_dataset_errors(f"{source}: {name}"):
+            n_chunks, n_stored = data[name].nchunks, data[name].nchunks_initialized
+        if n_stored < n_chunks:
+            missing = f"{n_chunks - n_stored} of {n_chunks} chunks are not stored, and count as {data[name].fill_value}"
+            warnings.warn(f"{source}: {name}: {missing}.", stacklevel=3)
+
+
 def _ended(data: Mapping[str, Any], names: Sequence[str], steps: slice, where: str) -> bool:
     """Whether the first of these arrays marks the last step of an episode."""
     name = _first(data, names)
-    return name is not None and bool(check_flags(data[name][steps], steps.stop - steps.start, f"{where}: {name}")[-1])
+    if name is None:
+        return False
+    return bool(check_flags(_steps(data, name, steps, where), steps.stop - steps.start, f"{where}: {name}")[-1])
 
 
 def _success(data: Mapping[str, Any], steps: slice, where: str) -> bool | None:
@@ -248,7 +273,7 @@ def _success(data: Mapping[str, Any], steps: slice, where: str) -> bool | None:
     name = _first(data, SUCCESSES)
     if name is None:
         return None
-    told, silent = told_flags(np.asarray(data[name][steps]), steps.stop - steps.start, f"{where}: {name}")
+    told, silent = told_flags(_steps(data, name, steps, where), steps.stop - steps.start, f"{where}: {name}")
     return None if silent[-1] else bool(told[-1])
 
 
@@ -281,23 +306,21 @@ def _chosen(
         array = parts[1] if parts else wanted
         if array not in data:
             raise DatasetError(f"{source}: data has no array {array!r}, only {', '.join(sorted(data))}.")
-        if data[array].shape[0] != n_steps:
-            raise DatasetError(f"{source}: {array} has shape {data[array].shape}, expected {n_steps} steps.")
         columns = slice(*(int(number) if number else None for number in parts.groups()[1:])) if parts else slice(None)
         found[name] = (array, columns)
     return found
 
 
-def _read(array: Any, steps: slice, columns: slice, where: str) -> np.ndarray:
+def _read(data: Mapping[str, Any], name: str, steps: slice, columns: slice, where: str) -> np.ndarray:
     """An episode of an array; images as bytes."""
-    values = np.asarray(array[steps])
+    values = _steps(data, name, steps, where)
     if values.ndim != 4 or values.dtype == np.uint8:
         return values if columns == slice(None) else values.reshape(len(values), -1)[:, columns]
     with np.errstate(invalid="ignore"):
         images = values.astype(np.uint8)
     if not (images == values).all():
         raise DatasetError(
-            f"{where}: images of {values.dtype} hold others than whole numbers from 0 to 255; scale them and store uint8, "
-            "or leave them out with observation_keys=[...]."
+            f"{where}: {name}: images of {values.dtype} hold others than whole numbers from 0 to 255; scale them and store "
+            "uint8, or leave them out with observation_keys=[...]."
         )
     return images
