@@ -1,15 +1,19 @@
 """Bad datasets, some hundreds: small good ones of each kind, each with one thing changed, and what should come of it."""
 
+import contextlib
 import itertools
 import json
 import math
 import os
+import re
 import shutil
+import signal
 import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import FrameType
 from typing import Any, NamedTuple
 
 import h5py
@@ -26,6 +30,8 @@ N_STEPS, N_OBSERVATIONS, N_ACTIONS = sum(LENGTHS), 3, 2
 MINARI_ID = "corpus/set-v0"
 DATA_FOLDER = Path("datasets") / MINARI_ID / "data"
 LEROBOT_INFO, LEROBOT_DATA = Path("meta/info.json"), Path("data/chunk-000/file-000.parquet")
+ARM, ZARR, ZARR_CHUNK = Path("arm"), Path("set.zarr"), 4  # folders, and rows of a chunk
+MOST_SECONDS = 5  # to read a dataset, or to refuse it
 # Results of reading: the good dataset's numbers, or other numbers.
 SAME, READ = "same", "read"
 SPARSE = 10**12  # rows
@@ -47,6 +53,30 @@ class Case(NamedTuple):
     change: Callable[[Path], object]
     dataset: str
     expected: str | tuple[str, ...]
+
+
+class Hang(BaseException):
+    """No reader may take it for an error of the file."""
+
+
+@contextlib.contextmanager
+def time_limit() -> Iterator[None]:
+    """
+    Break off what waits, such as for a pipe that nobody writes to.
+
+    :raises Hang: after MOST_SECONDS
+    """
+
+    def ring(number: int, frame: FrameType | None) -> None:
+        raise Hang
+
+    usual = signal.signal(signal.SIGALRM, ring)
+    signal.alarm(MOST_SECONDS)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, usual)
 
 
 # ---------------------------------------------------------------------------------------------------------- good ones
@@ -96,9 +126,10 @@ def write_good(folder: Path, monkeypatch: Any) -> None:
     np.savez(folder / "npz" / "set.npz", **flat_arrays())
     (folder / "flat").mkdir()
     with h5py.File(folder / "flat" / "set.hdf5", "w") as file:
-        for name, array in flat_arrays().items():
+        for name, array in d4rl_arrays().items():
             file[name] = array
-    write_lerobot(folder / "lerobot" / "arm")
+    write_lerobot(folder / "lerobot" / ARM)
+    write_zarr(folder / "zarr" / ZARR)
     for kind in ("csv", "table"):
         (folder / kind).mkdir()
     columns = table_columns()
@@ -128,6 +159,42 @@ def write_lerobot(folder: Path) -> None:
     counts = {"total_frames": N_STEPS, "total_episodes": len(LENGTHS)}
     (folder / LEROBOT_INFO).write_text(json.dumps({"codebase_version": "v3.0", **counts, "features": told}))
     pyarrow.parquet.write_table(pa.table({name: list(array) for name, array in features.items()}), folder / LEROBOT_DATA)
+
+
+def d4rl_arrays() -> dict[str, np.ndarray]:
+    names = {"terminations": "terminals", "truncations": "timeouts"}
+    return {names.get(name, name): array for name, array in flat_arrays().items() if name != "episode_ends"}
+
+
+def zarr_arrays() -> dict[str, np.ndarray]:
+    arrays = flat_arrays()
+    ends = arrays.pop("episode_ends")
+    names = {"observations": "state", "actions": "action", "rewards": "reward"}
+    return {**{f"data/{names.get(name, name)}": array for name, array in arrays.items()}, "meta/episode_ends": ends}
+
+
+def write_zarr(folder: Path) -> None:
+    """Format 2, whose every chunk is a file of its own."""
+    for group in (folder, folder / "data", folder / "meta"):
+        group.mkdir(parents=True)
+        (group / ".zgroup").write_text(json.dumps({"zarr_format": 2}))
+    for name, array in zarr_arrays().items():
+        write_zarr_array(folder / name, array)
+
+
+def write_zarr_array(folder: Path, array: np.ndarray, compressed: bool = False) -> None:
+    folder.mkdir()
+    chunks = (ZARR_CHUNK, *(max(1, n) for n in array.shape[1:]))[: array.ndim]
+    told = {"zarr_format": 2, "shape": array.shape, "chunks": chunks, "order": "C", "fill_value": 0, "filters": None,
+            "dtype": array.dtype.descr if array.dtype.names else array.dtype.str,
+            "compressor": {"id": "zlib", "level": 1} if compressed else None}  # fmt: skip
+    (folder / ".zarray").write_text(json.dumps(told))
+    for number in range(-(-len(array) // ZARR_CHUNK) if array.ndim else 1):
+        part = array[number * ZARR_CHUNK :][:ZARR_CHUNK] if array.ndim else array
+        chunk = np.zeros(chunks, array.dtype)
+        chunk[tuple(map(slice, part.shape))] = part
+        content = zlib.compress(chunk.tobytes()) if compressed else chunk.tobytes()
+        (folder / ".".join([str(number), *"0" * (array.ndim - 1)])).write_bytes(content)
 
 
 def flat_arrays() -> dict[str, np.ndarray]:
@@ -352,19 +419,39 @@ def of_array(make: Callable[[np.ndarray], Any]) -> Callable[[h5py.File, str, Pat
 
 MINARI_FIELDS = ("observations", "actions", "rewards", "terminations", "truncations")
 # Fields with another result than their row above: they are optional, or their shape may be another.
-EXCEPTIONS: dict[tuple[str, str, str], str | None] = {
+EXCEPTIONS: dict[tuple[str, str, str], str | tuple[str, ...] | None] = {
     ("hdf5", "observations", "row less"): SAME,  # the last one is not needed
     ("hdf5", "terminations", "column more"): None,
     **{("robomimic", field, "missing"): READ for field in ("rewards", "dones")},
     **{("robomimic", field, "no column"): None for field in ("rewards", "dones")},
-    **{(kind, field, name): READ for kind in ("hdf5", "robomimic", "npz") for field in
+    **{(kind, field, name): READ for kind in ("hdf5", "robomimic", "npz", "zarr") for field in
        ("terminations", "truncations", "dones") for name in ("float16", "float32", "integers", "small integers")},
+    **{("flat", field, name): READ for field in ("terminals", "timeouts") for name in
+       ("float16", "float32", "integers", "small integers")},
+    ("flat", "terminals", "missing"): SAME,
+    ("flat", "rewards", "missing"): READ,
+    ("flat", "actions", "missing"): ("set.hdf5", "has no group 'data', only 'observations'"),  # as robomimic's files have
     **{("npz", field, "missing"): READ for field in ("rewards", "terminations", "truncations", "episode_ends")},
-    **{("npz", "episode_ends", name): SAME for name in ("float16", "float32", "integers", "small integers")},
-    ("npz", "observations", "one more axis"): READ,  # (N, ...) is accepted
-    ("npz", "observations", "column more"): READ,
-    ("npz", "actions", "column more"): READ,
+    **{(kind, "episode_ends", name): SAME for kind in ("npz", "zarr") for name in
+       ("float16", "float32", "integers", "small integers")},
+    # (N, ...) is accepted
+    **{(kind, field, name): READ for kind, field in (("npz", "observations"), ("flat", "observations"), ("zarr", "state"))
+       for name in ("one more axis", "column more")},
+    **{(kind, field, "column more"): READ for kind, field in (("npz", "actions"), ("flat", "actions"), ("zarr", "action"))},
     ("robomimic", "obs/state", "flat"): READ,
+    **{("lerobot", field, name): READ for field in ("observation.state", "action") for name in ("wider", "flat")},
+    **{("table", field, "missing"): READ for field in ("obs_0", "action_0", "reward")},
+    ("table", "obs_0", "lists"): READ,
+    # An episode's name may be anything.
+    **{("table", "episode", name): READ for name in ("words", "dates", "too large")},
+    **{("csv", "episode", name): READ for name in
+       ("too large", "a word", "a hexadecimal number", "a comma", "a control character")},
+    **{("zarr", "reward", name): READ for name in ("missing", "a group")},
+    **{("zarr", field, name): SAME for field in ("terminations", "truncations") for name in ("missing", "a group")},
+    **{("zarr", "episode_ends", name): None for name in
+       ("a chunk unwritten", "nothing written", "a chunk is a link into nothing")},
+    ("zarr, chunk", "file", "cut off early"): SAME,  # it has less than that
+    **{("zarr, chunk", "file", name): READ for name in ("of zeros", "zeroed in the middle", "is a folder", "is missing")},
 }  # fmt: skip
 
 
@@ -378,6 +465,7 @@ def hdf5_cases() -> Iterator[Case]:
           for field in MINARI_FIELDS),
         *(("robomimic", f"data/demo_{DAMAGED}/{field}", field, f"demo_{DAMAGED}", "set.hdf5", Path("set.hdf5"))
           for field in ("obs/state", "actions", "rewards", "dones")),
+        *(("flat", field, field, "set.hdf5", "set.hdf5", Path("set.hdf5")) for field in d4rl_arrays()),
     ]  # fmt: skip
     changes = {**{name: (of_array(make), usual) for name, (make, usual) in CHANGED.items()}, **HDF5}
     for (kind, path, field, episode, dataset, file), (name, (change, usual)) in itertools.product(places, changes.items()):
@@ -546,21 +634,71 @@ FILES: dict[str, Callable[[bytes], bytes]] = {
 }
 
 
+def to_pipe(file: str | Path) -> Callable[[Path], object]:
+    def apply(folder: Path) -> None:
+        (folder / file).unlink()
+        os.mkfifo(folder / file)
+
+    return apply
+
+
+def to_link(file: str | Path, target: str | Path = "elsewhere") -> Callable[[Path], object]:
+    """Move a file, or a folder, and have a link in its place; `target` is below the folder of the copy."""
+
+    def apply(folder: Path) -> None:
+        (folder / file).rename(folder / target)
+        (folder / file).symlink_to(folder / target)
+
+    return apply
+
+
+class Place(NamedTuple):
+    """
+    A file of a good dataset.
+
+    :param good: which one
+    :param file: path in its folder
+    :param dataset: what is loaded, as in :class:`Case`
+    :param said: words of the message that refuses it
+    """
+
+    good: str
+    file: Path
+    dataset: str
+    said: str
+
+
+PLACES = {
+    "npz": Place("npz", Path("set.npz"), "set.npz", "set.npz"),
+    "robomimic": Place("robomimic", Path("set.hdf5"), "set.hdf5", "set.hdf5"),
+    "flat": Place("flat", Path("set.hdf5"), "set.hdf5", "set.hdf5"),
+    "csv": Place("csv", Path("set.csv"), "set.csv", "set.csv"),
+    "table": Place("table", Path("set.parquet"), "set.parquet", "set.parquet"),
+    "hdf5": Place("hdf5", DATA_FOLDER / "main_data.hdf5", MINARI_ID, "main_data.hdf5"),
+    "metadata": Place("hdf5", DATA_FOLDER / "metadata.json", MINARI_ID, "metadata.json"),
+    "arrow": Place("arrow", DATA_FOLDER / "1" / "part-0.arrow", MINARI_ID, "episode 1|data/1/part-0"),
+    "parquet": Place("parquet", DATA_FOLDER / "1" / "part-0.parquet", MINARI_ID, "episode 1|data/1/part-0"),
+    "lerobot": Place("lerobot", ARM / LEROBOT_DATA, str(ARM), "file-000.parquet|below data"),
+    "lerobot, info": Place("lerobot", ARM / LEROBOT_INFO, str(ARM), "info.json|arm"),
+    "zarr, metadata": Place("zarr", ZARR / "data/action/.zarray", str(ZARR), "set.zarr.*action"),
+    "zarr, chunk": Place("zarr", ZARR / "data/action/1.0", str(ZARR), "set.zarr.*action"),
+}
+
+
 def file_cases() -> Iterator[Case]:
-    places = {"npz": "set.npz", "robomimic": "set.hdf5", "hdf5": DATA_FOLDER / "main_data.hdf5",
-              "arrow": DATA_FOLDER / "1" / "part-0.arrow", "parquet": DATA_FOLDER / "1" / "part-0.parquet"}  # fmt: skip
-    for (kind, file), (name, change) in itertools.product(places.items(), FILES.items()):
-        is_path = kind in ("npz", "robomimic")
-        said: str | tuple[str, ...] = (Path(file).name,) if kind in ("npz", "robomimic", "hdf5") else ("episode 1",)
-        yield Case(f"{kind}: {name}", kind, whole_file(change, file), str(file) if is_path else MINARI_ID, said)
-    for kind, file in places.items():
-        is_path = kind in ("npz", "robomimic")
-        words = (Path(file).name,) if kind in ("npz", "robomimic", "hdf5") else ("episode 1",)
-        for name, make in {
+    for (place, (good, file, dataset, said)), (name, change) in itertools.product(PLACES.items(), FILES.items()):
+        outcome = expected(place, "file", name, None, (said,))
+        yield Case(f"{place}: {name}", good, whole_file(change, file), dataset, outcome)
+    for place, (good, file, dataset, said) in PLACES.items():
+        makes = {
             "is a folder": to_folder(file),
             "is missing": lambda folder, file=file: (folder / file).unlink(),
-        }.items():
-            yield Case(f"{kind}: {name}", kind, make, str(file) if is_path else MINARI_ID, words)
+            "is a pipe": to_pipe(file),
+        }
+        if dataset != str(file):
+            makes["is a link out of the folder"] = to_link(file)
+        for name, make in makes.items():
+            yield Case(f"{place}: {name}", good, make, dataset, expected(place, "file", name, None, (said,)))
 
 
 def metadata_change(**changes: Any) -> Callable[[Path], object]:
@@ -621,7 +759,7 @@ NO_SPECS: dict[str, Any] = {"empty": "", "a word": "Hopper", "a list": "[]", "nu
                             "a number for an id": '{"id": 3, "entry_point": "a:b", "additional_wrappers": []}'}  # fmt: skip
 NO_SCORES: dict[str, Any] = {"a word": "best", "a list": [1], "NaN": math.nan, "infinite": math.inf, "true": True}
 NO_METADATA: dict[str, bytes] = {
-    "empty": b"", "no JSON": b"{", "a list": b"[]", "a number": b"3", "null": b"null", "a word": b'"a"',
+    "no JSON": b"{", "a list": b"[]", "a number": b"3", "null": b"null", "a word": b'"a"',
     "an empty object": b"{}",
     "bytes": bytes(range(256)), "nested deeply": b"[" * 100_000, "many digits": b'{"total_steps": ' + b"9" * 10_000 + b"}",
     "UTF-16": '{"a": 1}'.encode("utf-16"),
@@ -671,18 +809,26 @@ def metadata_cases() -> Iterator[Case]:
     for name, content in NO_METADATA.items():
         change = whole_file(lambda _, content=content: content, DATA_FOLDER / "metadata.json")
         yield Case(f"metadata: {name}", "hdf5", change, MINARI_ID, ("metadata.json",))
-    yield Case("metadata: a folder", "hdf5", to_folder(DATA_FOLDER / "metadata.json"), MINARI_ID, ("metadata.json",))
 
 
 # -------------------------------------------------------------------------------------------- episodes of Minari, arrow
 
 
-def arrow_change(kind: str, change: Callable[[pa.Table], pa.Table]) -> Callable[[Path], object]:
+def parquet_change(file: Path, change: Callable[[pa.Table], pa.Table]) -> Callable[[Path], object]:
     def apply(folder: Path) -> None:
-        path = folder / DATA_FOLDER / "1" / f"part-0.{kind}"
-        if kind == "parquet":
-            pyarrow.parquet.write_table(change(pyarrow.parquet.read_table(path)), path)
-            return
+        with open(folder / file, "rb") as source:
+            table = pyarrow.parquet.read_table(source)
+        pyarrow.parquet.write_table(change(table), folder / file)
+
+    return apply
+
+
+def arrow_change(kind: str, change: Callable[[pa.Table], pa.Table]) -> Callable[[Path], object]:
+    if kind == "parquet":
+        return parquet_change(PLACES[kind].file, change)
+
+    def apply(folder: Path) -> None:
+        path = folder / PLACES[kind].file
         with pa.OSFile(str(path)) as source:
             table = pa.ipc.open_file(source).read_all()
         table = change(table)
@@ -706,32 +852,35 @@ def rows(array: np.ndarray) -> pa.Array:
     return pa.FixedSizeListArray.from_arrays(array.reshape(-1), array.shape[1])
 
 
+# Changes to a column, all of which Minari's reader refuses.
+VECTORS: dict[str, Callable[[np.ndarray], Any]] = {
+    "missing": lambda a: None,
+    "nan": lambda a: rows(with_first(a, np.nan)),
+    "infinite": lambda a: rows(with_first(a, np.inf)),
+    "wider": lambda a: rows(np.hstack([a, a])),
+    "flat": lambda a: pa.array(a[:, 0]),
+    "lists": lambda a: pa.array([list(row) for row in a[:-1]] + [[1.0]]),
+    "words": lambda a: pa.array(["a"] * len(a)),
+    "nothing": lambda a: pa.nulls(len(a)),
+    "objects": lambda a: pa.array([{"x": 1.0}] * len(a)),
+    "dates": lambda a: pa.array(np.arange(len(a)).astype("M8[s]")),
+    "with holes": lambda a: pa.array([None, *map(list, a[1:])], pa.list_(pa.float64(), a.shape[1])),
+}
+NUMBERS: dict[str, Callable[[np.ndarray], Any]] = {
+    "missing": lambda a: None,
+    "nan": lambda a: pa.array(with_first(a, np.nan)),
+    "words": lambda a: pa.array(["a"] * len(a)),
+    "nothing": lambda a: pa.nulls(len(a)),
+    "with holes": lambda a: pa.array([None, *a[1:]]),
+    "lists": lambda a: pa.array([[1.0, 2.0]] * len(a)),
+    "dates": lambda a: pa.array(np.arange(len(a)).astype("M8[s]")),
+}
+
+
 def arrow_cases() -> Iterator[Case]:
-    vectors: dict[str, Callable[[np.ndarray], Any]] = {
-        "missing": lambda a: None,
-        "nan": lambda a: rows(with_first(a, np.nan)),
-        "infinite": lambda a: rows(with_first(a, np.inf)),
-        "wider": lambda a: rows(np.hstack([a, a])),
-        "flat": lambda a: pa.array(a[:, 0]),
-        "lists": lambda a: pa.array([list(row) for row in a[:-1]] + [[1.0]]),
-        "words": lambda a: pa.array(["a"] * len(a)),
-        "nothing": lambda a: pa.nulls(len(a)),
-        "objects": lambda a: pa.array([{"x": 1.0}] * len(a)),
-        "dates": lambda a: pa.array(np.arange(len(a)).astype("M8[s]")),
-        "with holes": lambda a: pa.array([None, *map(list, a[1:])], pa.list_(pa.float64(), a.shape[1])),
-    }
-    numbers: dict[str, Callable[[np.ndarray], Any]] = {
-        "missing": lambda a: None,
-        "nan": lambda a: pa.array(with_first(a, np.nan)),
-        "words": lambda a: pa.array(["a"] * len(a)),
-        "nothing": lambda a: pa.nulls(len(a)),
-        "with holes": lambda a: pa.array([None, *a[1:]]),
-        "lists": lambda a: pa.array([[1.0, 2.0]] * len(a)),
-        "dates": lambda a: pa.array(np.arange(len(a)).astype("M8[s]")),
-    }
     for kind in ("arrow", "parquet"):
         for field in MINARI_FIELDS:
-            for name, make in (vectors if field in ("observations", "actions") else numbers).items():
+            for name, make in (VECTORS if field in ("observations", "actions") else NUMBERS).items():
                 change = arrow_change(kind, with_column(field, make))
                 words = ("episode 1", f"{field}|lists to be of size")
                 yield Case(f"{kind}, {field}: {name}", kind, change, MINARI_ID, words)
@@ -855,7 +1004,386 @@ def group_cases() -> Iterator[Case]:  # noqa: C901 (a list)
     yield case("robomimic", "actions out of bounds", "data/demo_1/actions", beyond, "set.hdf5", "demo_1", "action")
 
 
+# ------------------------------------------------------------------------------------------------------ LeRobot, tables
+
+
+CONTROL = "a\x1b[2Jb"  # clears a terminal that it is printed on
+# Changes above that leave numbers as many as they are, in types that Parquet holds.
+OTHER_NUMBERS = ("float32", "integers", "small integers", "inf", "-inf", "too large")
+
+
+def column_cases(kind: str, vectors: tuple[str, ...], numbers: tuple[str, ...]) -> Iterator[Case]:
+    """Changes to one column of a Parquet file that holds all steps."""
+    _, file, dataset, _ = PLACES[kind]
+
+    def case(field: str, name: str, make: Callable[[np.ndarray], Any], usual: str | None) -> Case:
+        field_said = re.split("[._]", field.removeprefix("next."))[0]
+        outcome = expected(kind, field, name, usual, (dataset, f"{field_said}|to be of size"))
+        return Case(f"{kind}, {field}: {name}", kind, parquet_change(file, with_column(field, make)), dataset, outcome)
+
+    for field in (*vectors, *numbers):
+        for name, make in (VECTORS if field in vectors else NUMBERS).items():
+            yield case(field, name, make, None)
+        for name in OTHER_NUMBERS:
+            changed, usual = CHANGED[name]
+            to_column = rows if field in vectors else pa.array
+            yield case(field, name, lambda a, changed=changed, to_column=to_column: to_column(changed(a)), usual)
+
+
+def twice(table: pa.Table) -> pa.Table:
+    return pa.concat_tables([table, table])
+
+
+def one_column_twice(table: pa.Table) -> pa.Table:
+    return table.append_column(table.column_names[0], table.column(0))
+
+
+def bomb(array: np.ndarray) -> pa.Array:
+    """Zeros that take a thousand times their bytes in the file."""
+    return rows(np.zeros((len(array), 400_000), np.float32))
+
+
+def info_change(**changes: Any) -> Callable[[Path], object]:
+    """Other entries of `meta/info.json`; a function is given the entry that is there."""
+
+    def apply(folder: Path) -> None:
+        path = folder / ARM / LEROBOT_INFO
+        info = json.loads(path.read_text())
+        info |= {name: value(info[name]) if callable(value) else value for name, value in changes.items()}
+        path.write_text(json.dumps({name: value for name, value in info.items() if value is not MISSING}))
+
+    return apply
+
+
+def feature(name: str, **changes: Any) -> Callable[[Path], object]:
+    def change(features: dict[str, Any]) -> dict[str, Any]:
+        told = {**features.get(name, {}), **changes}
+        return {**features, name: {key: value for key, value in told.items() if value is not MISSING}}
+
+    return info_change(features=change)
+
+
+def both(*changes: Callable[[Path], object]) -> Callable[[Path], object]:
+    return lambda folder: [change(folder) for change in changes]
+
+
+def lerobot_cases() -> Iterator[Case]:  # noqa: C901 (a list)
+    def case(name: str, change: Callable[[Path], object], *words: str) -> Case:
+        return Case(f"lerobot, {name}", "lerobot", change, str(ARM), words[0] if words[0] in (SAME, READ) else words)
+
+    def of_table(change: Callable[[pa.Table], pa.Table]) -> Callable[[Path], object]:
+        return parquet_change(ARM / LEROBOT_DATA, change)
+
+    yield from column_cases("lerobot", ("observation.state", "action"), ("next.reward", "frame_index", "episode_index"))
+    for field, right in {"total_episodes": len(LENGTHS), "total_frames": N_STEPS}.items():
+        for name, value in NO_COUNTS.items():
+            told = right + int(value) if value in ("+1", "-1") else value
+            yield case(f"{field}: {name}", info_change(**{field: told}), "info.json", field[6:])
+    versions = {**NO_STRINGS, **{each: each for each in ("v9.0", "v3.99", "v3.1", "v2.2", "v1.6", "v3", "3.0", "v3.0\n")}}
+    for name, value in versions.items():
+        yield case(f"codebase_version: {name!r}", info_change(codebase_version=value), "info.json", "codebase_version is")
+    for version in ("v2.0", "v2.1"):
+        yield case(f"codebase_version: {version}", info_change(codebase_version=version), SAME)
+    rates = {"a word": "a", "null": None, "zero": 0, "negative": -1, "NaN": math.nan, "infinite": math.inf, "true": True,
+             "a list": [30], "huge": 10**400}  # fmt: skip
+    for name, value in rates.items():
+        yield case(f"fps: {name}", info_change(fps=value), "info.json", "fps is")
+    for rate in (30, 0.5):
+        yield case(f"fps: {rate}", info_change(fps=rate), SAME)
+    for name, value in {**NO_STRINGS, "a word": "action", "of words": {"action": "float64"}}.items():
+        yield case(
+            f"features: {name}", info_change(features=value), "info.json|no feature", "features|action|cannot be read"
+        )
+    dtypes = {**NO_STRINGS, "words": "string", "objects": "object", "a video": "video", "an image": "image"}
+    for name, value in dtypes.items():
+        for field in ("action", "observation.state"):
+            words = ("arm|info.json", f"dtype|fps|{field.split('.')[0]}")
+            yield case(f"dtype of {field}: {name}", feature(field, dtype=value), *words)
+    for name, value in {"a number": 3, "a word": "abc", "null": None, "an object": {"a": 1}, "true": True}.items():
+        yield case(f"shape: {name}", feature("episode_index", shape=value), "info.json", "shape of episode_index is")
+    yield case("shape: huge", feature("episode_index", shape=[SPARSE, SPARSE]), SAME)
+    for name, content in NO_METADATA.items():
+        change = whole_file(lambda _, content=content: content, ARM / LEROBOT_INFO)
+        yield case(f"info: {name}", change, "info.json")
+    numbers = {"half an episode": 0.5, "an episode of -1": -1, "an infinite episode": math.inf}
+    for name, value in numbers.items():
+        made = with_column("episode_index", lambda a, value=value: pa.array(np.where(a == 1, value, a)))
+        yield case(name, of_table(made), "arm", f"episode_index is {value}.*a whole number of at least 0")
+    two_rewards = with_column("next.reward", lambda a: rows(np.stack([a, a], axis=1)))
+    yield case("two rewards", of_table(two_rewards), "arm", "next.reward has 2 numbers a frame; one")
+    one_less = with_column("frame_index", lambda a: pa.array(a + 1))
+    yield case("frames from 1 on", of_table(one_less), "arm", "episode 0: frame_index does not count its 4 frames from 0")
+    over = with_column("next.reward", lambda a: pa.array(np.full(len(a), 3e38)))
+    yield case("overflowing return", of_table(over), "arm", "episode 0", "rewards")
+    success = (
+        feature("next.success", dtype="float64"),
+        of_table(lambda t: t.append_column("next.success", [[0.5] * len(t)])),
+    )
+    yield case("half a success", both(*success), "arm", "next.success hold 0.5 at step 0; 0 and 1")
+    tables = {"no row": (lambda t: t[:0], "file-000.parquet"), "a row less": (lambda t: t[:-1], "14"),
+              "rows twice": (twice, "30"), "a column twice": (one_column_twice, "file-000.parquet"),
+              "other columns": (lambda t: t.rename_columns(list("abcde")), "has no column action, episode_index"),
+              "a bomb": (with_column("action", bomb), "claim")}  # fmt: skip
+    for name, (change, word) in tables.items():
+        yield case(name, of_table(change), "arm", word)
+    yield case("rows in another order", of_table(lambda t: t.take(list(range(len(t)))[::-1])), SAME)
+    yield case(
+        "a feature of control characters", both(feature(CONTROL, dtype="bool"), feature("action", dtype="a")), "arm", "2J"
+    )
+    yield case("a column of control characters", feature(f"observation.{CONTROL}", dtype="bool"), "file-000.parquet", "2J")
+    yield case("no data", lambda folder: shutil.rmtree(folder / ARM / "data"), "arm", "below data")
+    yield case(
+        "data are a link out of the folder", to_link(ARM / "data"), "data leads to .*; links within .*arm are accepted"
+    )
+    yield case(
+        "meta is a link out of the folder", to_link(ARM / "meta"), "meta leads to .*; links within .*arm are accepted"
+    )
+    yield case("a link to the root", lambda folder: (folder / ARM / "data/x").symlink_to("/"), "data/x leads to /; links")
+    yield case("a pipe beside the data", lambda folder: pipe(folder / ARM / "data"), "data/pipe is no regular file")
+    yield case("a link within", to_link(ARM / LEROBOT_DATA, ARM / "elsewhere"), SAME)
+    yield case("a link that leads back", lambda folder: (folder / ARM / "data/back").symlink_to(folder / ARM), SAME)
+
+
+def table_cases() -> Iterator[Case]:
+    def case(name: str, change: Callable[[pa.Table], pa.Table], *words: str) -> Case:
+        outcome = words[0] if words[0] in (SAME, READ) else ("set.parquet", *words)
+        return Case(f"table: {name}", "table", parquet_change(Path("set.parquet"), change), "set.parquet", outcome)
+
+    yield from column_cases("table", (), ("obs_0", "action_0", "reward", "episode"))
+    yield case("no row", lambda t: t[:0], "actions")
+    yield case("one row", lambda t: t[:1], READ)
+    yield case("rows twice", twice, "episode 0 comes in several places")
+    yield case("episodes in another order", lambda t: t.take(list(range(len(t)))[::-1]), READ)
+    yield case("rows in the order of rewards", lambda t: t.sort_by("reward"), "episode . comes in several places")
+    yield case("a column twice", one_column_twice, "obs_0")
+    yield case("other columns", lambda t: t.rename_columns(list("abcdefg")), "no array called one of actions", "only a, b")
+    names = [f"{CONTROL}{number}" for number in range(7)]
+    yield case("columns of control characters", lambda t: t.rename_columns(names), "no array called one of actions", "2J")
+    yield case("a bomb", with_column("obs_0", bomb), "claim")
+
+
+def csv_entry(field: str, make: Callable[[str], str]) -> Callable[[Path], object]:
+    """The first entry of a column is another text."""
+
+    def change(content: bytes) -> bytes:
+        first, second, *others = content.decode().split("\n")
+        entries = second.split(",")
+        number = first.split(",").index(field)
+        entries[number] = make(entries[number])
+        return "\n".join([first, ",".join(entries), *others]).encode()
+
+    return whole_file(change, "set.csv")
+
+
+def csv_cases() -> Iterator[Case]:
+    entries: dict[str, tuple[Callable[[str], str], str | None]] = {
+        "in quotes": (lambda word: f'"{word}"', SAME),
+        "in spaces": (lambda word: f"  {word} ", SAME),
+        "nearly nothing": (lambda word: "1e-400", READ),
+        "empty": (lambda word: "", None),
+        "nan": (lambda word: "nan", None),
+        "inf": (lambda word: "-inf", None),
+        "too large": (lambda word: "1e39", None),
+        "many digits": (lambda word: "9" * 5000, None),
+        "a word": (lambda word: "far", None),
+        "a hexadecimal number": (lambda word: "0x10", None),
+        "a comma": (lambda word: '"0,5"', None),
+        "a control character": (lambda word: CONTROL, None),
+    }
+    for field, (name, (make, usual)) in itertools.product(("obs_0", "action_0", "reward", "episode"), entries.items()):
+        outcome = expected("csv", field, name, usual, ("set.csv", field.split("_")[0]))
+        yield Case(f"csv, {field}: {name}", "csv", csv_entry(field, make), "set.csv", outcome)
+    texts: dict[str, tuple[Callable[[bytes], bytes], str]] = {
+        "with a byte order mark": (lambda text: b"\xef\xbb\xbf" + text, SAME),
+        "ends of lines of Windows": (lambda text: text.replace(b"\n", b"\r\n"), SAME),
+        "empty lines": (lambda text: text.replace(b"\n", b"\n\n"), SAME),
+        "no names": (lambda text: text.split(b"\n", 1)[1], "no array called one of actions"),
+        "names alone": (lambda text: text.split(b"\n", 1)[0], "no array called one of actions.*only nothing"),
+        "a short row": (lambda text: text + b"\n1.0,1.0", "row 17: has 2 entries, and the first row names 7"),
+        "a long row": (lambda text: text + b"\n" + b"1.0," * 8, "row 17: has 9 entries, and the first row names 7"),
+        "semicolons": (lambda text: text.replace(b",", b";"), "the first row is 'obs_0;.*; commas are expected between"),
+        "tabs": (lambda text: text.replace(b",", b"\t"), "the first row is .*; commas are expected between"),
+        "a name twice": (lambda text: text.replace(b"obs_1", b"obs_0"), "a name for each column is expected, each once"),
+        "rows twice": (lambda text: text + b"\n" + text.split(b"\n", 1)[1], "episode 0 comes in several places"),
+        "a quote without end": (lambda text: text + b'\n"', "cannot be read"),
+        "zero bytes": (lambda text: text.replace(b"0.", b"\0", 1), "hold object|cannot be read"),
+        "Latin-1": (lambda text: text.replace(b"obs_1", b"\xe9"), "cannot be read"),
+        "UTF-16": (lambda text: text.decode().encode("utf-16"), "cannot be read"),
+        "a huge entry": (lambda text: text + b"\n" + b"1" * 200_000, "cannot be read"),
+        "names of control characters": (
+            lambda text: text.replace(b"action", CONTROL.encode()),
+            "no array called one of actions.*2J",
+        ),
+    }
+    for name, (change, words) in texts.items():
+        outcome = words if words in (SAME, READ) else ("set.csv", words)
+        yield Case(f"csv, text: {name}", "csv", whole_file(change, "set.csv"), "set.csv", outcome)
+
+
+# --------------------------------------------------------------------------------------------------------------- zarr
+
+
+def zarr_told(**changes: Any) -> Callable[[Path], object]:
+    """Other entries of an array's `.zarray`; a function is given the entry that is there."""
+
+    def change(array: Path) -> None:
+        told = json.loads((array / ".zarray").read_text())
+        told |= {name: value(told[name]) if callable(value) else value for name, value in changes.items()}
+        (array / ".zarray").write_text(json.dumps(told))
+
+    return change
+
+
+def first_chunk(array: Path) -> Path:
+    return min(path for path in array.iterdir() if path.name != ".zarray")
+
+
+def compressed(array: Path) -> None:
+    shape, name = json.loads((array / ".zarray").read_text())["shape"], f"{array.parent.name}/{array.name}"
+    shutil.rmtree(array)
+    write_zarr_array(array, zarr_arrays()[name].reshape(shape), compressed=True)
+
+
+def zarr_group(array: Path) -> None:
+    shutil.rmtree(array)
+    array.mkdir()
+    (array / ".zgroup").write_text(json.dumps({"zarr_format": 2}))
+
+
+def in_first_chunk(content: Callable[[bytes], bytes]) -> Callable[[Path], object]:
+    return lambda array: first_chunk(array).write_bytes(content(first_chunk(array).read_bytes()))
+
+
+def nothing_written(array: Path) -> None:
+    for path in array.iterdir():
+        if path.name != ".zarray":
+            path.unlink()
+
+
+# Changes to the folder of an array, and the expected result; None expects a refusal that names the array.
+ZARR_ARRAYS: dict[str, tuple[Callable[[Path], object], str | None]] = {
+    "missing": (shutil.rmtree, None),
+    "a group": (zarr_group, None),
+    "compressed": (compressed, SAME),
+    "a chunk unwritten": (lambda array: first_chunk(array).unlink(), READ),
+    "nothing written": (nothing_written, READ),
+    "a short chunk": (in_first_chunk(lambda content: content[:1]), None),
+    "a long chunk": (in_first_chunk(lambda content: 2 * content), None),
+    "a short compressed chunk": (both(compressed, in_first_chunk(lambda content: content[:9])), None),
+    "a compressed chunk of other bytes": (both(compressed, in_first_chunk(lambda content: zlib.compress(b"1"))), None),
+    "no compression where it is told": (zarr_told(compressor={"id": "zlib", "level": 1}), None),
+    "a pickle for a compressor": (zarr_told(compressor={"id": "pickle"}), None),
+    "an unknown compressor": (zarr_told(compressor={"id": "json2"}), None),
+    "a number for a compressor": (zarr_told(compressor=3), None),
+    "a pickle for a filter": (zarr_told(filters=[{"id": "pickle", "protocol": 4}]), None),
+    "objects": (zarr_told(dtype="|O"), None),
+    "claimed records": (zarr_told(dtype=[["a", "<f4"]]), None),
+    "an unknown type": (zarr_told(dtype="<f9"), None),
+    "claimed": (zarr_told(shape=lambda shape: [SPARSE, *shape[1:]]), None),
+    "a negative shape": (zarr_told(shape=lambda shape: [-15, *shape[1:]]), None),
+    "a word for a shape": (zarr_told(shape="15"), None),
+    "chunks of no row": (zarr_told(chunks=lambda chunks: [0, *chunks[1:]]), None),
+    "huge chunks": (zarr_told(chunks=lambda chunks: [SPARSE, *chunks[1:]]), None),
+    "another format": (zarr_told(zarr_format=9), None),
+    "a chunk is a pipe": (lambda array: to_pipe(first_chunk(array).name)(array), None),
+    "a chunk is a link out of the folder": (lambda array: to_link(first_chunk(array), array.parents[2] / "x")(array), None),
+    "a chunk is a link within": (lambda array: to_link(first_chunk(array), array.parent / "x")(array), SAME),
+    "a chunk is a link into nothing": (lambda array: (first_chunk(array).unlink(), (array / "0").symlink_to("none")), READ),
+    "is a link out of the folder": (lambda array: to_link(array, array.parents[2] / "x")(array), None),
+}
+
+
+# Arrays that zarr opens together, so that the message names their file alone.
+NOT_OPENED = ("an unknown type", "a negative shape", "a word for a shape", "another format")
+
+
+def zarr_change(name: str, change: Callable[[Path], object]) -> Callable[[Path], object]:
+    return lambda folder: change(folder / ZARR / name)
+
+
+def zarr_array(make: Callable[[np.ndarray], Any]) -> Callable[[Path], object]:
+    def change(array: Path) -> None:
+        made = np.asarray(make(zarr_arrays()[f"{array.parent.name}/{array.name}"]))
+        shutil.rmtree(array)
+        write_zarr_array(array, made)
+
+    return change
+
+
+def zipped(change: Callable[[Path], object]) -> Callable[[Path], object]:
+    def apply(folder: Path) -> None:
+        change(folder)
+        shutil.make_archive(str(folder / ZARR), "zip", folder / ZARR)
+
+    return apply
+
+
+def zarr_cases() -> Iterator[Case]:
+    # Long doubles are read by its second version alone.
+    arrays = {name: (zarr_array(make), usual) for name, (make, usual) in CHANGED.items() if name != "long double"}
+    said = {"state": "state|observ", "action": "action|episode_ends"}
+    for path, (name, (change, usual)) in itertools.product(zarr_arrays(), {**arrays, **ZARR_ARRAYS}.items()):
+        field = path.rpartition("/")[2]
+        words = ("set.zarr",) if name in NOT_OPENED else ("set.zarr", said.get(field, field))
+        outcome = expected("zarr", field, name, usual, words)
+        yield Case(f"zarr, {field}: {name}", "zarr", zarr_change(path, change), str(ZARR), outcome)
+    for name, (change, usual) in ZARR_ARRAYS.items():
+        if " link " not in name and " pipe" not in name:  # which a zip cannot hold
+            outcome = usual or (("set.zarr.zip",) if name in NOT_OPENED else ("set.zarr.zip", "action"))
+            yield Case(
+                f"zarr zip, action: {name}", "zarr", zipped(zarr_change("data/action", change)), f"{ZARR}.zip", outcome
+            )
+    for name, content in FILES.items():
+        change = both(zipped(lambda folder: None), whole_file(content, f"{ZARR}.zip"))
+        yield Case(f"zarr zip: {name}", "zarr", change, f"{ZARR}.zip", ("set.zarr.zip",))
+
+    def in_both(name: str, change: Callable[[Path], object], *words: str) -> Iterator[Case]:
+        outcome = words[0] if words[0] in (SAME, READ) else ("set.zarr", *words)
+        yield Case(f"zarr: {name}", "zarr", change, str(ZARR), outcome)
+        yield Case(f"zarr zip: {name}", "zarr", zipped(change), f"{ZARR}.zip", outcome)
+
+    def wrote(file: str, content: Any) -> Callable[[Path], object]:
+        return lambda folder: (folder / ZARR / file).write_text(content if isinstance(content, str) else json.dumps(content))
+
+    pickled = {"compressor": {"id": "pickle"}, "dtype": "<f8"}
+    consolidated = {"metadata": {"data/action/.zarray": pickled}, "zarr_consolidated_format": 1}
+    # In the consolidated metadata of zarr's third format an array's name stands where a user's attributes do elsewhere.
+    hidden = {"attributes": {"codecs": [{"name": "numcodecs.pickle"}], "data_type": "float32"}}
+    yield from in_both("a pickle in consolidated metadata", wrote(".zmetadata", consolidated), "zmetadata: codec 'pickle'")
+    yield from in_both(
+        "a pickle in an array called attributes",
+        wrote("zarr.json", {"consolidated_metadata": {"metadata": hidden}}),
+        r"zarr\.json: codec 'numcodecs\.pickle'",
+    )
+    yield from in_both("a file of another name", wrote("data/x.zarray", "[" * 100_000), SAME)
+    yield from in_both("metadata of an array nested deeply", wrote("data/state/.zarray", "[" * 100_000), "state")
+    yield from in_both("a bomb of metadata", wrote("data/state/.zarray", " " * 2**26), "state")
+    control = lambda folder: (folder / ZARR / "data/action").rename(folder / ZARR / "data" / CONTROL)  # noqa: E731
+    yield from in_both("an array of control characters", control, "data has no array actions or .*2J")
+    yield from in_both("no group data", lambda folder: shutil.rmtree(folder / ZARR / "data"), "data")
+    ends = {"halves": [4.5, 10, 15], "nan": [4, math.nan, 15], "beyond the data": [4, 10, 99], "descending": [10, 4, 15],
+            "from zero": [0, 4, 15], "too early": [4, 10], "negative": [-4, 10, 15]}  # fmt: skip
+    for name, value in ends.items():
+        change = zarr_change("meta/episode_ends", zarr_array(lambda _, value=value: np.array(value)))
+        yield Case(
+            f"zarr, ends: {name}", "zarr", change, str(ZARR), ("set.zarr", "meta/episode_ends is .*, the last one 15")
+        )
+    two_rewards = zarr_change("data/reward", zarr_array(lambda a: np.stack([a, a], axis=1)))
+    yield Case("zarr: two rewards", "zarr", two_rewards, str(ZARR), ("set.zarr", r"reward has shape \(15, 2\)"))
+    yield Case("zarr: is a pipe", "zarr", lambda folder: (shutil.rmtree(folder / ZARR), os.mkfifo(folder / ZARR)), str(ZARR),
+               ("set.zarr is no regular file",))  # fmt: skip
+    yield Case("zarr zip: is a pipe", "zarr", lambda folder: os.mkfifo(folder / f"{ZARR}.zip"), f"{ZARR}.zip",
+               ("set.zarr.zip is no regular file",))  # fmt: skip
+    yield Case("zarr zip: is missing", "zarr", lambda folder: None, f"{ZARR}.zip", ("set.zarr.zip does not exist",))
+    yield Case(
+        "zarr: is missing", "zarr", lambda folder: shutil.rmtree(folder / ZARR), str(ZARR), ("set.zarr does not exist",)
+    )
+    yield Case("zarr: a pipe beside the data", "zarr", lambda folder: pipe(folder / ZARR / "data"), str(ZARR),
+               ("data/pipe is no regular file",))  # fmt: skip
+
+
 def cases() -> list[Case]:
     """All of them."""
-    parts = (hdf5_cases, npz_cases, file_cases, metadata_cases, arrow_cases, group_cases)
+    minari_and_files = (hdf5_cases, npz_cases, file_cases, metadata_cases, arrow_cases, group_cases)
+    parts = (*minari_and_files, lerobot_cases, table_cases, csv_cases, zarr_cases)
     return list(itertools.chain.from_iterable(part() for part in parts))

@@ -108,27 +108,3 @@ def test_numbered_columns_come_by_their_numbers(write):
 def test_steps_of_an_episode_lie_side_by_side(write):
     with pytest.raises(DatasetError, match=r"episode a comes in several places; .* as after a stable sort"):
         load_dataset(write({**COLUMNS, "episode": list("ababa")}))
-
-
-UNFIT = {
-    "a short row": ("obs_0,action,done\n1,0.5,0\n1,0.5\n", r"log.csv, row 3: has 2 entries, and the first row names 3"),
-    "semicolons": ("obs_0;action;done\n1,5;0,5;1\n", "the first row is 'obs_0;action;done'; commas are expected between"),
-    "a name twice": ("obs_0,obs_0,action\n1,2,3\n", "a name for each column is expected, each once"),
-    "words": ("obs_0,action,done\nfar,0.5,1\n", "obs_0 hold object; real numbers are expected"),
-    "a hole": ("obs_0,action,done,reward\n1,0.5,0,1\n,0.5,1,1\n", "episode 0, step 1: observations hold nan"),
-    "nothing": ("", "has no array called one of actions, action, acts, only nothing"),
-}
-
-
-@pytest.mark.parametrize(("text", "message"), UNFIT.values(), ids=UNFIT)
-def test_what_is_no_table_is_refused(text, message, tmp_path):
-    (tmp_path / "log.csv").write_text(text)
-    with pytest.raises(DatasetError, match=message):
-        load_dataset(tmp_path / "log.csv")
-
-
-def test_a_parquet_file_that_claims_more_than_it_stores(tmp_path):
-    zeros = pa.array(np.zeros(40_000_000, np.float32))
-    pq.write_table(pa.table({"obs_0": zeros, "action": zeros, "reward": zeros}), tmp_path / "log.parquet")
-    with pytest.raises(DatasetError, match=r"40000000 rows claim \d+ bytes, of which \d+ are stored"):
-        load_dataset(tmp_path / "log.parquet")

@@ -344,6 +344,12 @@ def test_tensors_that_no_model_has_are_refused(group, change, message, saved, tm
     assert message in refused(forged(saved, lambda configuration: None, change, group), tmp_path)
 
 
+def test_the_page_on_reliability_counts_them():
+    page = (Path(__file__).parents[2] / "docs" / "reliability.md").read_text()
+    n = len(BAD_CONFIGURATIONS) + len(BAD_TENSORS) + len(BAD_STATES)
+    assert f"| {n} of {n} refused within a second |" in page
+
+
 def test_members_that_are_missing_too_many_or_not_what_they_claim_are_refused(saved, tmp_path):
     parts = members(saved)
     for name in parts:
