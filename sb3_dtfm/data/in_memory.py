@@ -285,7 +285,8 @@ def load_replay_buffer(
     ends = replay_buffer.dones[order] > 0
     ends[:-1] |= _breaks(replay_buffer, order)
     ends[-1:] = True  # so far
-    pieces, unfinished = [], []
+    pieces: list[tuple[int, int, int]] = []
+    unfinished: list[tuple[int, int, int]] = []
     for env in range(replay_buffer.n_envs):
         stops = np.flatnonzero(ends[:, env]) + 1
         starts = np.concatenate(([0], stops[:-1])) if len(stops) else stops

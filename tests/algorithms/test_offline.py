@@ -48,7 +48,7 @@ def test_one_episode_is_learned_by_heart(algorithm, policy_kwargs):
     model = make_model(
         algorithm, buffer, policy_kwargs=overfit, learning_rate=2e-3, learning_rate_schedule="cosine", warmup_steps=50,
         weight_decay=0.0, batch_size=32, context_length=5, precision="float32", max_grad_norm=1.0,
-    ).learn(600)  # fmt: skip
+    ).learn(400)  # fmt: skip
     returns_to_go, state = buffer.returns_to_go.numpy(), None
     for t in range(len(episode)):
         observation = {
