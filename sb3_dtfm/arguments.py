@@ -49,12 +49,13 @@ class Number(NamedTuple):
 
     def __str__(self) -> str:
         kind = "whole number" if self.whole else "number"
+        low, high = (f"{limit:.0f}" if self.whole else f"{limit:g}" for limit in (self.low, self.high))
         if math.isinf(self.high):
-            limits = "" if math.isinf(self.low) else f" {'above' if self.above_low else 'of at least'} {self.low:g}"
+            limits = "" if math.isinf(self.low) else f" {'above' if self.above_low else 'of at least'} {low}"
             text = f"a {'' if limits else 'finite '}{kind}{limits}"
         else:
             left, right = "(" if self.above_low else "[", ")" if self.below_high else "]"
-            text = f"a {kind} in {left}{self.low:g}, {self.high:g}{right}"
+            text = f"a {kind} in {left}{low}, {high}{right}"
         return f"{text}, or None" if self.optional else text
 
 

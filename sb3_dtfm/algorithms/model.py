@@ -49,11 +49,10 @@ from sb3_dtfm.policies.exported import ExportedPolicy
 # The names of an algorithm's one policy: Stable-Baselines3's for dictionaries, which it observes, for vectors and images.
 POLICY_NAMES = ("MultiInputPolicy", "MlpPolicy", "CnnPolicy")
 
-LARGEST = th.finfo(th.float32).max
 # Arguments of an algorithm, beside TrainingOptions, that are numbers.
 ACCEPTED: dict[str, Rule] = {
     "seed": Number(low=0, high=2**32 - 1, whole=True, optional=True),
-    "target_return": Number(low=-LARGEST, high=LARGEST, optional=True),
+    "target_return": Number(optional=True),
 }
 
 SelfModel = TypeVar("SelfModel", bound="SequenceModel")

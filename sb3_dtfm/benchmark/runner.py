@@ -108,14 +108,15 @@ class Runner:
         own = job.settings.get("callback") or []
         callbacks = [*(own if isinstance(own, list) else [own]), {CALLBACK: arguments}]
         settings = yaml.safe_dump({env_id: {**job.settings, "callback": callbacks}})
-        (folder / SETTINGS).write_text(settings)
         equal = [attempt for attempt in earlier if _settings_of(attempt).replace(str(attempt), str(folder)) == settings]
-        for attempt in equal[-1:]:
+        # Settings are written last: an attempt that was killed while it copied is no attempt.
+        for attempt in sorted(equal, key=_has_checkpoint)[-1:]:
             with contextlib.suppress(OSError):  # killed before it had anything
                 shutil.copytree(attempt / LOGS, folder / LOGS)
                 shutil.copyfile(attempt / ROWS, folder / ROWS)
+        (folder / SETTINGS).write_text(settings)
         for attempt in earlier:
-            if attempt in equal or not any(attempt.rglob(CHECKPOINT)):
+            if attempt in equal or not _settings_of(attempt) or not _has_checkpoint(attempt):
                 shutil.rmtree(attempt, ignore_errors=True)
             else:
                 _say(f"{job.key}: {attempt} holds an interrupted run with other settings, which is kept")
@@ -250,6 +251,10 @@ def run_grid(jobs: Sequence[Job], n_finished: int, options: argparse.Namespace) 
             print(f"{log}: {(log.read_text().strip().splitlines() or ['nothing was written'])[-1]}")
         raise SystemExit(1)
     print(f"All {len(jobs) + n_finished} runs are finished: sb3-dtfm report {options.results}", flush=True)
+
+
+def _has_checkpoint(attempt: Path) -> bool:
+    return any(attempt.rglob(CHECKPOINT))
 
 
 def _settings_of(attempt: Path) -> str:

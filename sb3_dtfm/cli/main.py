@@ -77,7 +77,8 @@ def _parser() -> argparse.ArgumentParser:
 def _fail(command: str, message: str) -> int:
     from sb3_dtfm.files import printable  # with torch, which --help and --version do not wait for
 
-    print(f"sb3-dtfm {command}: error: {printable(message)}", file=sys.stderr)
+    lines = "\n".join(map(printable, message.split("\n")))
+    print(f"sb3-dtfm {command}: error: {lines}", file=sys.stderr)
     return 2
 
 

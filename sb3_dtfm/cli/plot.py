@@ -127,7 +127,7 @@ def plot_learning_curve(
 
 def _counted(run: Path) -> str:
     """Name what the time steps of a run count."""
-    offline = run.parent.name in ALGORITHMS and not (run / EPISODES).exists()
+    offline = run.resolve().parent.name in ALGORITHMS and not (run / EPISODES).exists()
     return "gradient steps" if offline else "timesteps"
 
 

@@ -414,7 +414,7 @@ def _numbered(arrays: Arrays, n_steps: int) -> np.ndarray:
     numbers = np.asarray(arrays.stored(name)).reshape(-1)
     if numbers.shape != (n_steps,):
         raise DatasetError(f"{arrays.source}: {name} has {len(numbers)} entries; actions have {n_steps} steps.")
-    if not np.isfinite(numbers).all() if numbers.dtype.kind == "f" else None in numbers.tolist():
+    if not _all_given(numbers):
         raise DatasetError(f"{arrays.source}: {name} is not given at each step; a number or a name is expected.")
     changes = np.flatnonzero(numbers[1:] != numbers[:-1]) + 1
     starts, counts = np.unique(numbers[np.append(0, changes)].astype(str), return_counts=True)
@@ -425,6 +425,14 @@ def _numbered(arrays: Arrays, n_steps: int) -> np.ndarray:
             "after a stable sort."
         )
     return np.append(changes, n_steps)
+
+
+def _all_given(numbers: np.ndarray) -> bool:
+    """Return whether an episode is numbered or named at each step."""
+    kind = numbers.dtype.kind
+    if kind == "O":
+        return all(isinstance(each, str | int | np.integer) and each != "" for each in numbers.tolist())
+    return bool(np.isfinite(numbers).all()) if kind == "f" else kind != "U" or bool((numbers != "").all())
 
 
 def _told_stops(arrays: Arrays, name: str, n_steps: int) -> np.ndarray:

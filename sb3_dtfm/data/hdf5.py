@@ -2,7 +2,9 @@
 
 import contextlib
 import math
+import re
 import zlib
+from operator import itemgetter
 
 import h5py
 import numpy as np
@@ -13,6 +15,9 @@ from sb3_dtfm.data.trajectories import DatasetError, check_real, check_size, wra
 # Links one after the other that are followed at most, which is HDF5's own limit.
 MOST_LINKS = 16
 CHECKSUM = 4  # bytes that Fletcher's filter adds to a chunk
+# A run of up to 32 bytes behind its length, a short reference, or a long one with its length in the second byte.
+LZF_RUNS = [b"\\x%02x.{%d}" % (n, n + 1) for n in range(32)]
+LZF_TOKEN = re.compile(b"|".join([*LZF_RUNS, b"[\\x20-\\xdf].", b"[\\xe0-\\xff].."]), re.DOTALL)
 
 
 def read_hdf5(group: h5py.Group, name: str, where: str) -> np.ndarray:
@@ -170,17 +175,11 @@ def _check_chunk(data: h5py.h5d.DatasetID, info: h5py.h5d.StoreInfo, filters: li
 
 def _lzf_length(packed: bytes) -> int:
     """Count the bytes that LZF unpacks: runs of up to 32 bytes as they are, and references to up to 264 earlier ones."""
-    length = at = 0
-    while at < len(packed):
-        first = packed[at]
-        n_same = first >> 5
-        if n_same == 0:
-            length, at = length + first + 1, at + first + 2
-        elif n_same == 7:
-            length, at = length + 9 + (packed[at + 1] if at + 1 < len(packed) else 0), at + 3
-        else:
-            length, at = length + n_same + 2, at + 2
-    return length
+    tokens = LZF_TOKEN.findall(packed)
+    first = np.frombuffer(bytes(map(itemgetter(0), tokens)), np.uint8)
+    second = np.frombuffer(bytes(map(itemgetter(1), tokens)), np.uint8)
+    lengths = np.select([first < 32, first < 224], [first + 1, (first >> 5) + 2], 9 + second.astype(np.int64))
+    return int(lengths.sum())
 
 
 def _stored_within(data: h5py.h5d.DatasetID) -> bool:

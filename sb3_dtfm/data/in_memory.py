@@ -293,11 +293,12 @@ def load_replay_buffer(
         for start, stop in list(zip(starts, stops, strict=True))[int(replay_buffer.full) :]:
             finished = replay_buffer.dones[order[stop - 1], env] > 0
             (pieces if finished else unfinished).append((env, start, stop))
-    if pieces and unfinished:  # their returns would be those of their first steps alone
-        n_left_out = sum(stop - start for _, start, stop in unfinished)
+    if unfinished:  # their returns are those of their first steps alone
+        n_unfinished = sum(stop - start for _, start, stop in unfinished)
+        fate = "are left out" if pieces else "are all that there is"
         warnings.warn(
-            f"{source}: {len(unfinished)} unfinished episodes with {n_left_out} steps are left out, which another learn() "
-            "or the buffer's end cut off.",
+            f"{source}: {len(unfinished)} unfinished episodes with {n_unfinished} steps {fate}; another learn(), or the "
+            "buffer's end, cut them off.",
             stacklevel=3,
         )
     pieces = pieces or unfinished

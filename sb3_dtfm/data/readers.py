@@ -50,7 +50,7 @@ ACCEPTED: dict[str, Rule] = {
     "max_episode_steps": Number(low=1, whole=True, optional=True),
     "best_share": Number(low=0.0, high=1.0, above_low=True, optional=True),
     "fraction": Number(low=0.0, high=1.0, above_low=True),
-    "fraction_seed": Number(low=0, whole=True),
+    "fraction_seed": Number(low=0, whole=True, optional=True),
 }
 
 
@@ -186,7 +186,8 @@ def load_dataset(
     :raises TypeError: the reader has no such option
     """
     named = {"cache_dir": cache_dir, "env_id": env_id, "max_episode_steps": max_episode_steps, "min_return": min_return}
-    check_options({**kwargs, **named, "success_only": success_only, "allow_pickle": allow_pickle})
+    named |= {"best_share": best_share, "success_only": success_only, "fraction": fraction, "fraction_seed": fraction_seed}
+    check_options({**kwargs, **named, "allow_pickle": allow_pickle})
     dataset = unpickled(dataset, allow_pickle)
     reader = _find_reader(dataset)
     parameters = inspect.signature(reader.load).parameters

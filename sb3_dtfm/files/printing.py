@@ -2,5 +2,5 @@
 
 
 def printable(text: str) -> str:
-    """Write control characters, which a file may hold to change what a terminal shows, as escapes; lines stay lines."""
-    return "".join(each if each.isprintable() or each == "\n" else repr(each)[1:-1] for each in text)
+    """Write control characters, which a file may hold to change what a terminal shows, as escapes."""
+    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)

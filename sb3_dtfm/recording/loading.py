@@ -168,7 +168,8 @@ def check_saved_by(asked: type[BaseAlgorithm], model: Path) -> None:
         configuration = read_configuration(model)
         saved_by = str(configuration.get("algorithm"))
         if not issubclass(asked, SequenceModel) or saved_by != head_name(asked.policy_aliases):
-            finetuned = "Finetuned" if configuration["attributes"].get("online_actor") is not None else ""
+            attributes = configuration.get("attributes")
+            finetuned = "Finetuned" if isinstance(attributes, dict) and attributes.get("online_actor") is not None else ""
             raise ValueError(f"{model} was saved by {finetuned}{saved_by}, not by {asked.__name__} (--algo).")
         return
     try:

@@ -1,6 +1,6 @@
 """RL-Zoo's experiments that start from a DTFM: noise-space RL, residual RL, or DTFM's own online fine-tuning."""
 
-import filecmp
+import hashlib
 import inspect
 import os
 import shutil
@@ -181,6 +181,7 @@ class FinetunedManager(FinetuningManager):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        self.sha256 = hashlib.sha256(self.base_file.read_bytes()).hexdigest()
         if self.trained_agent:
             try:
                 check_saved_by(ALGOS[self.algo], Path(self.trained_agent))
@@ -201,9 +202,9 @@ class FinetunedManager(FinetuningManager):
         """
         run = agent.parent / self.env_name
         known = read_run(run) if (run / "config.yml").is_file() else {}
-        learned_on = next((Path(known[key]["model"]) for key in FROZEN_ENVS if key in known), self.base_file)
-        if learned_on.is_file() and not filecmp.cmp(learned_on, self.base_file, shallow=False):
-            raise UsageError(f"-i {agent}: it learned on {learned_on}, and --model is another DTFM, {self.base_file}.")
+        about: dict[str, Any] = next((known[key] for key in FROZEN_ENVS if key in known), {})
+        if about.get("sha256", self.sha256) != self.sha256:
+            raise UsageError(f"-i {agent}: it learned on another DTFM than {self.base_file}: {about.get('model')}.")
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Read the settings of the online algorithm, and of the wrapper that it learns in."""
@@ -213,7 +214,7 @@ class FinetunedManager(FinetuningManager):
         print(f"{self.algo.upper()} {'adds residual actions to those' if residual else 'chooses the noise'} of {self.base}")
         keep_one_action(self.finetuned.policy, residual)
         saved = {name: value for name, value in hyperparams.items() if name != "vec_env_wrapper"}
-        saved[key] = {**arguments, "algorithm": self.algo, "model": str(self.base_file)}
+        saved[key] = {**arguments, "algorithm": self.algo, "model": str(self.base_file), "sha256": self.sha256}
         path = f"{FROZEN_ENVS[key].__module__}.{FROZEN_ENVS[key].__name__}"
         hyperparams["vec_env_wrapper"] = [{path: {**arguments, "model": self.finetuned}}]
         return hyperparams, OrderedDict(sorted(saved.items()))

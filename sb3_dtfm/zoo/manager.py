@@ -127,13 +127,14 @@ class OfflineExperimentManager(ExperimentManager):
         if not self.optimize_hyperparameters and 0 < len(missing) < len(study):
             raise UsageError(f"{', '.join(missing)}: needed, too, to train with a trial of a study; -optimize makes one.")
 
-    def load_trial(self, storage: str, *args: Any, **kwargs: Any) -> dict[str, Any]:
+    def load_trial(self, storage: str, study_name: str, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """
         Load a trial's settings as RL-Zoo does; whoever wrote the study runs nothing by them.
 
         :raises ValueError: a class that is not known here, or Python that is no literal
         """
-        return check_settings(super().load_trial(storage, *args, **kwargs), storage, [*CLASSES, *EVALUATED])
+        settings = super().load_trial(storage, study_name, *args, **kwargs)
+        return check_settings(settings, f"study {study_name!r}", [*CLASSES, *EVALUATED])
 
     def _check_settings(self, hyperparams: dict[str, Any]) -> None:
         """

@@ -173,6 +173,28 @@ def test_a_run_that_fails_leaves_a_log_and_the_grid_goes_on(instead, says, grid,
     assert not finished.exists()
 
 
+CHECKPOINT = "pathlib.Path(sys.argv[sys.argv.index('--conf-file') + 1]).parent / 'logs/checkpoint.zip'"
+
+
+def test_an_interrupted_run_with_other_settings_is_kept(grid, stub, workplace, capfd):
+    grid += ["--algo", "dtfm", "--fractions", "1"]
+    stub(
+        f"file = {CHECKPOINT}; file.parent.mkdir(); file.write_text(str(settings['n_timesteps'])); "
+        "pathlib.Path(arguments['rows']).touch(); sys.exit(1)"
+    )
+    for n_steps in ("6", "8"):
+        with pytest.raises(SystemExit):
+            main([*grid, "-n", n_steps])
+    assert "holds an interrupted run with other settings, which is kept" in capfd.readouterr().out
+    folder = workplace / "logs" / "benchmark" / f"{TASK}_1_dtfm_seed0_tiny"
+    (folder / "attempt-killed/logs").mkdir(parents=True)  # while it copied, before its settings were written
+    (folder / "attempt-killed/logs/checkpoint.zip").touch()
+    stub(f"pathlib.Path('found').write_text(({CHECKPOINT}).read_text())")
+    assert main([*grid, "-n", "6"]) == 0
+    assert (workplace / "found").read_text() == "6"
+    assert sorted(path.read_text() for path in folder.glob("attempt-*/logs/checkpoint.zip")) == ["6", "8"]
+
+
 def test_results_and_logs_may_share_a_folder(grid, stub, workplace):
     stub("pass")
     assert main([*grid, "--algo", "dt", "--fractions", "1", "-o", "mine", "-f", "mine"]) == 0

@@ -297,7 +297,9 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
     SAC("MlpPolicy", "Pendulum-v1", buffer_size=1).save("agent")
     cut = workplace / "cut/HalfCheetah-v5"
     cut.mkdir(parents=True)
-    (cut / "config.yml").write_text("!!python/object/apply:collections.OrderedDict [[[noise_env, {model: untold.zip}]]]")
+    (cut / "config.yml").write_text(
+        "!!python/object/apply:collections.OrderedDict [[[noise_env, {model: old.zip, sha256: 1a}]]]"
+    )
     (cut.parent / "agent_9_steps.zip").write_bytes((workplace / "agent.zip").read_bytes())
     (workplace / "mine.yml").write_text("default: {policy: MlpPolicy, n_steps: 8, batch_size: 8, n_timestep: 64}")
     wrong = "vec_env_wrapper:['stable_baselines3.common.vec_env.VecMonitor']"
@@ -319,7 +321,7 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
         f"--model {run} -params use_sde:True": "its exploration depends on the state (use_sde)",
         f"--model {run} --algo ppo -i agent.zip": "-i: agent.zip was saved by SAC, not by PPO (--algo). It takes",
         f"--model {run} --algo sac -i untold.zip": "-i: untold.zip was saved by DTFM, not by SAC (--algo).",
-        f"--model {run} --algo sac -i cut/agent_9_steps.zip": "it learned on untold.zip, and --model is another DTFM, ",
+        f"--model {run} --algo sac -i cut/agent_9_steps.zip": "/HalfCheetah-v5.zip: old.zip.",
         f"--model {run} --algo ppo --conf-file mine.yml": "n_timestep (did you mean n_timesteps?): no hyperparameter",
         f"--model {run} --algo ppo --conf-file mine.yml -n -1": "n_timesteps: the settings have none; add it there, or give",
         f"--model {run} -optimize": "-optimize: hyperparameters of finetune cannot be searched",

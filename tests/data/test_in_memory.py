@@ -419,7 +419,8 @@ def test_an_episode_without_an_end_is_all_that_there_is():
     buffer = ReplayBuffer(5, spaces.Box(-1, 1, (1,)), spaces.Box(-1, 1, (1,)), device="cpu")
     for step in range(4):
         buffer.add(np.array([step / 10]), np.array([(step + 1) / 10]), np.zeros(1), np.zeros(1), np.zeros(1), [{}])
-    loaded = load_dataset(buffer)
+    with pytest.warns(UserWarning, match="1 unfinished episodes with 4 steps are all that there is; another learn()"):
+        loaded = load_dataset(buffer)
     assert loaded.episode_lengths.tolist() == [4]
     assert not loaded.terminated[0]
 

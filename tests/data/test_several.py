@@ -39,7 +39,7 @@ def test_the_better_episodes(options, returns):
 def test_what_leaves_nothing_is_refused():
     with pytest.raises(DatasetError, match="arrays: no episode has min_return 7; the largest return is 2"):
         load_dataset(arrays(0.0), min_return=7)
-    with pytest.raises(ValueError, match=r"best_share must lie in \(0, 1\], got 0"):
+    with pytest.raises(ValueError, match=r"best_share must be a number in \(0, 1\], or None, got 0"):
         load_dataset(arrays(0.0), best_share=0)
 
 

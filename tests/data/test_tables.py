@@ -20,7 +20,8 @@ NAMES = {"obs_0": "position", "obs_1": "speed", "action": "force"}
 
 
 def as_csv(path, columns):
-    rows = [",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]
+    rows = [["" if each is None else str(each) for each in row] for row in zip(*columns.values(), strict=True)]
+    rows = [",".join(columns), *map(",".join, rows)]
     (path / "log.csv").write_text("\n".join(rows) + "\n")
     return path / "log.csv"
 
@@ -47,6 +48,12 @@ def check(buffer):
     np.testing.assert_array_equal(buffer.actions[:, 0], COLUMNS["action"])
     assert buffer.episode_lengths.tolist() == [2, 3]
     assert buffer.episode_returns.tolist() == [1, 2]
+
+
+@pytest.mark.parametrize("episodes", [["b", "b", None, "a", "a"], [1, 1, None, 2, 2]])
+def test_an_episode_is_named_at_each_step(write, episodes):
+    with pytest.raises(DatasetError, match="episode is not given at each step"):
+        load_dataset(write({**COLUMNS, "episode": episodes}))
 
 
 def test_columns_by_how_they_begin_or_by_name(write):

@@ -109,13 +109,16 @@ def test_environments_of_fine_tuning_are_compared(path, lift, stiff):
     finetuned.set_env(wrapped(stiff))
 
 
+RETURN_TO_GO_WRAPPER = "sb3_dtfm.envs.ReturnToGoWrapper"
+
+
 def test_environments_of_commands_are_compared(path, lift):
     found = FoundModel("final-model", str(path), str(path.parent))
     options = argparse.Namespace(env=argparse.Namespace(gym_id=LIFT), algo="dtfm", seed=0, n_eval_episodes=1)
     swept = argparse.Namespace(env=LIFT, n_envs=1, episodes=1, env_kwargs=[], seed=0)
     files = AgentFiles(path, wrapper=wrapped)
     for act in (
-        lambda: _without_pickles(found, LIFT, n_envs=1, hyperparams={"env_wrapper": "sb3_dtfm.envs.ReturnToGoWrapper"}),
+        lambda: _without_pickles(found, "dtfm", LIFT, n_envs=1, hyperparams={"env_wrapper": RETURN_TO_GO_WRAPPER}),
         lambda: load_fitting_agent("dtfm", files, wrapped(lift), None, "cpu"),
         lambda: sweep.sweep(DTFM.load(path), files, swept, [1.0], argparse.Namespace(n=0)),
         lambda: push.evaluate(found, files, options),
