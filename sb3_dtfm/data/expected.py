@@ -10,6 +10,7 @@ from sb3_dtfm.data.episodes import Statistics
 
 HIDDEN_DIM = 256
 N_TIMESTEPS, BATCH_SIZE, LEARNING_RATE, WEIGHT_DECAY = 3000, 256, 1e-3, 1e-2
+MOST_EPOCHS, FEWEST_TIMESTEPS = 100, 300  # of less than 7,680 recorded steps
 N_AT_ONCE = 8192
 # 0.5 is the mean; near 1, the best. A model without the recorded noise reaches more than the recorded mean.
 EXPECTILE = 0.95
@@ -82,9 +83,10 @@ def _regression(steps: Steps, statistics: Statistics, seed: int) -> th.Tensor:
         th.manual_seed(seed)
         network = _network(steps.observations.shape[1] + 1)
         optimizer = th.optim.AdamW(network.parameters(), LEARNING_RATE, weight_decay=WEIGHT_DECAY, fused=True)
-        for i in range(N_TIMESTEPS):
+        n_timesteps = min(N_TIMESTEPS, max(FEWEST_TIMESTEPS, MOST_EPOCHS * n_steps // BATCH_SIZE))
+        for i in range(n_timesteps):
             for group in optimizer.param_groups:
-                group["lr"] = LEARNING_RATE * 0.5 * (1.0 + math.cos(math.pi * i / N_TIMESTEPS))
+                group["lr"] = LEARNING_RATE * 0.5 * (1.0 + math.cos(math.pi * i / n_timesteps))
             chosen = th.randint(n_steps, (BATCH_SIZE,))
             wanted = steps.returns_to_go.index_select(0, steps.rows[chosen]) / scale
             optimizer.zero_grad(set_to_none=True)
