@@ -1,6 +1,7 @@
 """Measures of how well actions are predicted by observation, by previous action, and by observation and return."""
 
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch as th
@@ -69,13 +70,24 @@ def correlation_of_changes(buffer: TrajectoryBuffer) -> float:
     return float((before * after).sum() / size) if size > 0 else 0.0
 
 
+_known: WeakKeyDictionary[TrajectoryBuffer, PredictionErrors | None] = WeakKeyDictionary()
+
+
 def prediction_errors(buffer: TrajectoryBuffer) -> PredictionErrors | None:
     """
     Predict the actions of at most 16,384 steps, each by regressions on other episodes: a fifth of them is held out in turn.
 
+    Models that learn from the same buffer share the result.
+
     :param buffer: Discrete actions count as vectors
     :return: by the best of three penalties each; None where fewer than two episodes have a step that follows another
     """
+    if buffer not in _known:
+        _known[buffer] = _prediction_errors(buffer)
+    return _known[buffer]
+
+
+def _prediction_errors(buffer: TrajectoryBuffer) -> PredictionErrors | None:
     generator = th.Generator().manual_seed(0)
     chosen = th.randperm(len(buffer), generator=generator)[:MAX_STEPS].sort().values
     chosen = chosen[buffer.timesteps.cpu()[chosen] > 0]
