@@ -1,5 +1,5 @@
 """
-Worth of the critic's choice on an arm by how samples are drawn, and by whom (docs/studies/finetuning.md).
+Worth of the critic's choice for manipulation by how samples are drawn, and by whom (docs/studies/rollouts.md).
 
     python studies/action_samples.py --n 16 --noise 1.5 logs/dtfm/robosuite-Can-v0_7/robosuite-Can-v0.zip ...
     python studies/action_samples.py --together models --n 8 ONE.zip TWO.zip THREE.zip

@@ -10,7 +10,7 @@ from sb3_dtfm.data.episodes import Statistics
 
 HIDDEN_DIM = 256
 N_TIMESTEPS, BATCH_SIZE, LEARNING_RATE, WEIGHT_DECAY = 3000, 256, 1e-3, 1e-2
-MOST_EPOCHS, FEWEST_TIMESTEPS = 100, 300  # of less than 7,680 recorded steps
+MOST_EPOCHS, FEWEST_TIMESTEPS = 100, 300  # below 7,680 recorded steps
 N_AT_ONCE = 8192
 # 0.5 is the mean; near 1, the best. A model without the recorded noise reaches more than the recorded mean.
 EXPECTILE = 0.95

@@ -341,8 +341,8 @@ def _warn_of_inner_ends(ended: np.ndarray, stops: np.ndarray, arrays: Arrays) ->
         flags = " or ".join(arrays.name(names) for names in (TERMINATIONS, TRUNCATIONS, DONES) if arrays.has(names))
         borders = next(arrays.name(names) for names in ((ENDS,), (LENGTHS,), EPISODES) if arrays.has(names))
         warnings.warn(
-            f"{arrays.source}: {flags} tells of an end at {inner.sum()} steps inside episodes, the first one at step {step} "
-            f"of episode {episode}. Episodes end where {borders} says; leave {borders} out if they end earlier.",
+            f"{arrays.source}: {flags}: {inner.sum()} steps inside episodes are flagged as ends, first step {step} of "
+            f"episode {episode}. Episodes end where {borders} says; leave {borders} out if they end earlier.",
             stacklevel=2,
         )
 

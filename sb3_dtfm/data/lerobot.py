@@ -153,7 +153,7 @@ def _info(folder: Path, source: str) -> dict[str, Any]:
         info: dict[str, Any] = json.loads(path.read_text())
         version = info.get("codebase_version")
         if not re.fullmatch(r"v2\.[01]|v3\.0", str(version)):
-            raise DatasetError(f"{source}: {INFO}: codebase_version is {version!r:.20}; formats v2.0 to v3.0 are read.")
+            raise DatasetError(f"{source}: {INFO}: codebase_version is {version!r:.20}; v2.0, v2.1 and v3.0 are read.")
         for name in ("total_frames", "total_episodes"):
             if not COUNT.accepts(info[name]):
                 raise DatasetError(f"{source}: {INFO}: {name} is {info[name]!r:.20}; {COUNT} is expected.")
@@ -206,7 +206,7 @@ def _check_labels(columns: dict[str, np.ndarray], labels: Sequence[str], reward:
             raise DatasetError(f"{source}: {name} has {columns[name].shape[1]} numbers a frame; one is expected.")
     for name in set(labels) - {reward, TIME}:
         check_flags(columns[name], len(columns[name]), f"{source}: {name}")
-    with np.errstate(invalid="ignore"):  # of infinity nothing is left
+    with np.errstate(invalid="ignore"):  # infinity % 1 is NaN
         odd = (columns[EPISODE] % 1 != 0) | (columns[EPISODE] < 0)
     if odd.any():
         raise DatasetError(f"{source}: {EPISODE} is {columns[EPISODE][odd][0]}; {EPISODE_NUMBER} is expected.")

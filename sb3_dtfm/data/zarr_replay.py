@@ -48,8 +48,8 @@ NOT_OBSERVED = {*ACTIONS, *REWARDS, *TERMINATIONS, *TRUNCATIONS, *DONES, *EPISOD
 METADATA = (".zarray", ".zmetadata", "zarr.json")
 CODECS = {"blosc", "bytes", "bz2", "crc32c", "delta", "endian", "gzip", "lz4", "shuffle", "transpose", "zlib", "zstd"}
 NUMBERS = re.compile(r"[<>|]?(b|i|u|f|bool|int|uint|float)\d*")
-# A part of an array's columns: "state[:2]".
 MOST_COUNTED = 10_000  # chunks of an array, which take seconds to count
+# A part of an array's columns: "state[:2]".
 COLUMNS = re.compile(r"(.+)\[(\d*):(\d*)\]")
 
 
@@ -254,10 +254,9 @@ def _check_lengths(data: Mapping[str, Any], observed_arrays: Sequence[str], n_st
 def _warn_of_missing_chunks(data: Mapping[str, Any], names: Sequence[str], source: str) -> None:
     """Zarr leaves out a chunk that holds its fill value alone, so that no reader can tell it from one that is lost."""
     for name in names:
-        if data[name].nchunks > MOST_COUNTED:
-            continue
         with wrap_dataset_errors(f"{source}: {name}"):
-            n_chunks, n_stored = data[name].nchunks, data[name].nchunks_initialized
+            n_chunks = data[name].nchunks
+            n_stored = data[name].nchunks_initialized if n_chunks <= MOST_COUNTED else n_chunks
         if n_stored < n_chunks:
             missing = f"{n_chunks - n_stored} of {n_chunks} chunks are not stored, and count as {data[name].fill_value}"
             warnings.warn(

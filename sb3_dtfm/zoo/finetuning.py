@@ -204,7 +204,7 @@ class FinetunedManager(FinetuningManager):
         known = read_run(run) if (run / "config.yml").is_file() else {}
         about: dict[str, Any] = next((known[key] for key in FROZEN_ENVS if key in known), {})
         if about.get("sha256", self.sha256) != self.sha256:
-            raise UsageError(f"-i {agent}: it learned on another DTFM than {self.base_file}: {about.get('model')}.")
+            raise UsageError(f"-i {agent}: learned on {about.get('model')}, not on these weights of {self.base_file}.")
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Read the settings of the online algorithm, and of the wrapper that it learns in."""
@@ -277,8 +277,8 @@ class FinetunedManager(FinetuningManager):
         buffer = getattr(model, "replay_buffer", None)
         if buffer is not None and buffer.n_envs != env.num_envs:
             raise UsageError(
-                f"-i {self.trained_agent}: the replay buffer beside it is of {buffer.n_envs} environments, and there are "
-                f"{env.num_envs} now; -params n_envs:{buffer.n_envs} keeps their number."
+                f"-i {self.trained_agent}: its replay buffer has {buffer.n_envs} environments, this run has {env.num_envs}; "
+                f"use -params n_envs:{buffer.n_envs}."
             )
         return model
 

@@ -90,7 +90,7 @@ class OfflineExperimentManager(ExperimentManager):
         if resumed is not None and self.algo not in ALGORITHMS:  # whose checkpoints are pickles
             raise UsageError(f"--resume {resumed}: runs of {' and '.join(ALGORITHMS)} go on, none of --algo {self.algo}.")
         if resumed is not None and self.optimize_hyperparameters:
-            raise UsageError(f"--resume {resumed}: a search is no run; -optimize with its --storage continues it.")
+            raise UsageError(f"--resume {resumed}: -optimize continues by its --storage and --study-name.")
         if restored is not None:
             restored.check_config(self.config)
         self.valueless: list[str] = []  # why trials of a search have no value

@@ -70,7 +70,7 @@ class Start(NamedTuple):
         if not (run / START).is_file():
             agents = sorted(run.glob(f"{AGENT}*.zip"), key=lambda path: path.stat().st_mtime)
             if agents:
-                raise UsageError(f"--resume {run}: only --algo dtfm resumes; -i {agents[-1]} continues this in a new run.")
+                raise UsageError(f"--resume {run}: it cannot resume; `finetune -i {agents[-1]}` continues in a new run.")
             raise UsageError(
                 f"--resume {run}: nothing to go on with; the run is finished, or `sb3-dtfm {command}` did not start it."
             )

@@ -283,7 +283,7 @@ def test_a_replay_buffer_goes_on_with_as_many_environments(run, workplace, capsy
     assert main(arguments) == 0
     agent = "logs/finetuned/HalfCheetah-v5_1/agent.zip"
     assert main([*arguments, "n_envs:2", "-i", agent]) == 2
-    message = f"-i {agent}: the replay buffer beside it is of 1 environments, and there are 2 now; -params n_envs:1 keeps"
+    message = f"-i {agent}: its replay buffer has 1 environments, this run has 2; use -params n_envs:1."
     assert message in capsys.readouterr().err
     assert len(list((workplace / "logs/finetuned").iterdir())) == 1
 
@@ -321,7 +321,7 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
         f"--model {run} -params use_sde:True": "its exploration depends on the state (use_sde)",
         f"--model {run} --algo ppo -i agent.zip": "-i: agent.zip was saved by SAC, not by PPO (--algo). It takes",
         f"--model {run} --algo sac -i untold.zip": "-i: untold.zip was saved by DTFM, not by SAC (--algo).",
-        f"--model {run} --algo sac -i cut/agent_9_steps.zip": "/HalfCheetah-v5.zip: old.zip.",
+        f"--model {run} --algo sac -i cut/agent_9_steps.zip": "learned on old.zip, not on these weights of",
         f"--model {run} --algo ppo --conf-file mine.yml": "n_timestep (did you mean n_timesteps?): no hyperparameter",
         f"--model {run} --algo ppo --conf-file mine.yml -n -1": "n_timesteps: the settings have none; add it there, or give",
         f"--model {run} -optimize": "-optimize: hyperparameters of finetune cannot be searched",
@@ -331,7 +331,7 @@ def test_what_does_not_fit_is_said_in_one_line(run, workplace, capsys):
         assert main([*FINETUNE, *arguments.split()]) == 2, arguments
         assert message in capsys.readouterr().err, arguments
     assert main(["finetune", "--resume", "cut"]) == 2
-    assert "only --algo dtfm resumes; -i cut/agent_9_steps.zip continues this in a new run." in capsys.readouterr().err
+    assert "it cannot resume; `finetune -i cut/agent_9_steps.zip` continues in a new run." in capsys.readouterr().err
     assert main(["train", "--algo", "finetuned", "--env", "HalfCheetah-v5"]) == 2
     assert "--algo finetuned: such models come from `sb3-dtfm finetune`" in capsys.readouterr().err
     assert not list((workplace / "logs").glob("finetuned/*"))

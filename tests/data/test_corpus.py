@@ -25,7 +25,7 @@ ROWS = {
     "`.npz`": ("npz",),
     "D4RL": ("flat",),
     "LeRobot": ("lerobot",),
-    "zarr, zip": ("zarr",),
+    "zarr": ("zarr",),
     "CSV": ("csv",),
     "Parquet": ("table",),
 }

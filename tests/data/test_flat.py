@@ -81,7 +81,7 @@ def test_numbers_and_dones_tell_of_episodes(kind, path):
 
 @pytest.mark.parametrize("kind", ["ends", "lengths"])
 def test_flags_inside_an_episode_are_told_of(kind, path):
-    message = "terminals tells of an end at 2 steps inside episodes, the first one at step 1 of episode 1"
+    message = "terminals: 2 steps inside episodes are flagged as ends, first step 1 of episode 1"
     with pytest.warns(UserWarning, match=f"{message}. Episodes end where episode_{kind} says"):
         buffer = load_dataset(str(write(path, **ENDS[kind], terminals=flags(1, 3, 6, 8))))
     assert buffer.episode_lengths.tolist() == [2, 3, 4]
