@@ -222,7 +222,7 @@ OF_START = {
     "settings in YAML": (["--conf-file", "logs/evil.yml"], "--conf-file logs/evil.yml"),
     "a study": (
         [*PACKAGED, "--storage", "study.log", "--study-name", "s", "--trial-id", "1"],
-        "study.log: normalize: expected",
+        "study 's': normalize: expected",
     ),
     "a search": ([*PACKAGED, "--optimize"], "-optimize"),
     "a module's task": (["--env", f"{PLANTED}:HalfCheetah-v5"], "not found in gym registry"),
@@ -424,7 +424,7 @@ RUNS_NOTHING = {
                 "--trial-id",
                 str(trial),
             ],
-            f"study.log: {name}",
+            f"study 's': {name}",
         )
         for name, trial in TRIALS.items()
     },
