@@ -6,6 +6,7 @@ import os
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
+from numbers import Real
 from typing import Any, NamedTuple
 
 import h5py
@@ -431,7 +432,9 @@ def _all_given(numbers: np.ndarray) -> bool:
     """Return whether an episode is numbered or named at each step."""
     kind = numbers.dtype.kind
     if kind == "O":
-        return all(isinstance(each, str | int | np.integer) and each != "" for each in numbers.tolist())
+        return all(
+            isinstance(each, str | bytes | Real) and each not in ("", b"") and each == each for each in numbers.tolist()
+        )
     return bool(np.isfinite(numbers).all()) if kind == "f" else kind != "U" or bool((numbers != "").all())
 
 

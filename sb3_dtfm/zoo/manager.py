@@ -65,7 +65,7 @@ class OfflineExperimentManager(ExperimentManager):
     - An environment of dt or dtfm always shows a return-to-go, and the run's settings hold its target return.
     - dt and dtfm are evaluated before the first gradient step and after the last one too.
     - Only the first process of a training runs callbacks.
-    - dt and dtfm keep a checkpoint while they train, and a run goes on from it.
+    - dt and dtfm keep a checkpoint while they train, and an interrupted run resumes from it.
     - The last evaluation is compared with the recorded episodes.
 
     :param arguments: what the command was called with

@@ -62,7 +62,7 @@ class Hang(BaseException):
 @contextlib.contextmanager
 def time_limit() -> Iterator[None]:
     """
-    Break off what waits, such as for a pipe that nobody writes to.
+    Break off what waits, such as for a pipe without a writer.
 
     :raises Hang: after MOST_SECONDS
     """
@@ -306,7 +306,7 @@ def unwritten(file: h5py.File, path: str, folder: Path) -> None:
 
 
 def pipe(folder: Path) -> str:
-    """A pipe that nobody writes to, so that whoever opens it waits for ever."""
+    """A pipe without a writer, so that whoever opens it waits for ever."""
     os.mkfifo(folder / "pipe")
     return str(folder / "pipe")
 

@@ -182,6 +182,12 @@ def test_arrays_that_are_not_read_may_hold_anything(path):
         assert len(load_dataset(path)) == N
 
 
+def test_names_and_numbers_of_episodes_may_be_objects():
+    for episodes in (["b", 1, 2.0], [b"b", np.int64(1), np.float64(2.0)]):
+        named = np.repeat(np.array(episodes, dtype=object), [2, 3, 4])
+        assert load_flat(arrays(episode_ends=None, episode=named)).episode_lengths.tolist() == [2, 3, 4]
+
+
 def test_control_characters_of_names_are_not_printed(path):
     write(path, actions=None, **{"\x1b[2J": np.zeros(N)})
     with pytest.raises(DatasetError, match=r"only \\x1b\[2J, episode_ends, obs") as refusal:

@@ -50,7 +50,7 @@ def check(buffer):
     assert buffer.episode_returns.tolist() == [1, 2]
 
 
-@pytest.mark.parametrize("episodes", [["b", "b", None, "a", "a"], [1, 1, None, 2, 2]])
+@pytest.mark.parametrize("episodes", [["b", "b", None, "a", "a"], [1, 1, None, 2, 2], ["b", "b", "", "a", "a"]])
 def test_an_episode_is_named_at_each_step(write, episodes):
     with pytest.raises(DatasetError, match="episode is not given at each step"):
         load_dataset(write({**COLUMNS, "episode": episodes}))
