@@ -403,10 +403,13 @@ def test_a_hub_that_cannot_be_reached_fails_at_once(monkeypatch: pytest.MonkeyPa
     """Minari's client would look for it five times, for half a minute."""
     monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
     monkeypatch.setenv("MINARI_REMOTE", "hf://farama-minari")
-    begin = time.monotonic()
-    with pytest.raises(DatasetError, match=r"test/none-v0 is not in .*; and it cannot be downloaded: .*refused"):
-        load_minari("test/none-v0")
-    assert time.monotonic() - begin < 5.0
+    waited = []
+    for _ in range(2):  # the first imports the client
+        begin = time.monotonic()
+        with pytest.raises(DatasetError, match=r"test/none-v0 is not in .*; and it cannot be downloaded: .*refused"):
+            load_minari("test/none-v0")
+        waited.append(time.monotonic() - begin)
+    assert min(waited) < 5.0
 
 
 def test_entries_of_dictionary_observations_are_chosen():
