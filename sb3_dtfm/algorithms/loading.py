@@ -55,6 +55,8 @@ SAVED: dict[str, Rule] = {
     "_current_learning_rate": NOT_NEGATIVE,
     "_training_seed": Number(low=0, high=2**64, below_high=True, whole=True, optional=True),
 }
+# Attributes of several values, each with a check of its own.
+STRUCTURED = {"policy_kwargs", "dataset_kwargs", "score_reference", "return_reference", "controller", "online_actor"}
 # Values of a ReturnReference, in its order.
 RETURN_REFERENCE: tuple[Rule, ...] = (
     *(Number(), Number(), Number(), COUNT, BOOLEAN),

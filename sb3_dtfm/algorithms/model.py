@@ -19,9 +19,10 @@ from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dtfm.actions import ActionSpace, same_actions
-from sb3_dtfm.algorithms.loading import SavedModel, check_policy, parameters, read_saved, wrap_file_errors
+from sb3_dtfm.algorithms.loading import SAVED, STRUCTURED, SavedModel, check_policy, parameters, read_saved, wrap_file_errors
 from sb3_dtfm.algorithms.options import TrainingOptions
 from sb3_dtfm.algorithms.saving import (
+    ENCODED,
     OPTIMIZER,
     POLICY,
     UnsavedSchedule,
@@ -332,10 +333,10 @@ class SequenceModel(BaseAlgorithm):
                 f"{source} is a fine-tuned DTFM: sb3_dtfm.finetuning.FinetunedDTFM loads it. To go on learning, `sb3-dtfm "
                 "finetune -i` takes the agent.zip beside it, and --model the DTFM that it began with."
             )
-        never = set(model._excluded_save_params()) - set(custom_objects)
-        for name in attributes:  # others than the model's own are a user's, which nothing here reads
-            if name in never or hasattr(cls, name) or not name.isidentifier():
-                raise ModelFileError(f"{source}: {name!r} is no attribute that a model is saved with.")
+        accepted = (cls._saved_names() | ENCODED) - set(model._excluded_save_params()) | set(custom_objects)
+        for name in attributes:
+            if name not in accepted or hasattr(cls, name):
+                raise ModelFileError(f"{source}: {name!r} is no attribute that a {cls.__name__} is saved with.")
         vars(model).update(attributes)
         known = {*vars(model), *inspect.signature(cls).parameters}
         if unknown := sorted(set(changed) - known):
@@ -400,14 +401,14 @@ class SequenceModel(BaseAlgorithm):
         :param exclude: attributes to leave out beside the default ones
         :param include: attributes to save although they are left out by default
         :raises OSError: names the path, where what was there before still is
-        :raises ValueError: an attribute of `include` that is no plain value
+        :raises ValueError: an attribute of `include` that is no plain value, or of which a model knows nothing
         """
         if not is_first_process():
             return
         wanted = set(include or ())
         left_out = {*self._excluded_save_params(), *(exclude or ())} - wanted
         tensors = {POLICY: self.get_parameters()[POLICY], OPTIMIZER: optimizer_tensors(self.policy)}
-        write_model(path, ModelFile(to_configuration(self, left_out, wanted), tensors))
+        write_model(path, ModelFile(to_configuration(self, self._saved_names(), left_out, wanted), tensors))
         self._last_saved = file_name(path)
 
     def export(self, path: str | PathLike[str], env_id: str | None = None, target_return: float | None = None) -> None:
@@ -437,6 +438,13 @@ class SequenceModel(BaseAlgorithm):
         about = {"algorithm": type(self).__name__, "version": version("sb3-dtfm")}
         settings = {**about, "env_id": env_id, "target_return": target_return, **exported.settings}
         write_onnx(path, exported, exported.example(), exported.outputs, settings)
+
+    @classmethod
+    def _saved_names(cls) -> set[str]:
+        """Attributes that a file may set: this package's, and of a subclass those that its constructor takes."""
+        given = inspect.signature(cls).parameters.values()
+        arguments = {each.name for each in given if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)}
+        return {*SAVED, *STRUCTURED, *ACCEPTED, *TrainingOptions.__dataclass_fields__, *arguments} - {"_init_setup_model"}
 
     def _excluded_save_params(self) -> list[str]:
         of_an_environment = [

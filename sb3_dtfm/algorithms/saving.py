@@ -3,7 +3,7 @@
 import json
 import math
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -54,11 +54,14 @@ class UnsavedSchedule:
         )
 
 
-def to_configuration(model: BaseAlgorithm, left_out: Iterable[str], wanted: Iterable[str]) -> dict[str, Any]:
+def to_configuration(
+    model: BaseAlgorithm, known: Collection[str], left_out: Iterable[str], wanted: Iterable[str]
+) -> dict[str, Any]:
     """
     The attributes of a model as JSON.
 
     :param model: to save
+    :param known: attributes that loading accepts
     :param left_out: attributes not to save
     :param wanted: attributes that the caller asked for by name
     :raises ValueError: one that is wanted cannot be saved
@@ -72,9 +75,11 @@ def to_configuration(model: BaseAlgorithm, left_out: Iterable[str], wanted: Iter
     saved: dict[str, Any] = {}
     for name, value in attributes.items():
         try:
+            if name not in known:
+                raise ValueError("no model has such an attribute; of a subclass its constructor's arguments are saved")
             saved[name] = _json(value)
         except (TypeError, ValueError) as error:
-            problem = f"{name} is no part of a saved model: it is a {type(value).__name__}, not plain values ({error})."
+            problem = f"{name} is no part of a saved model: {error}."
             if name in wanted:
                 raise ValueError(problem) from error
             warnings.warn(problem, stacklevel=3)
@@ -124,7 +129,7 @@ def _plain(value: Any) -> Any:
     """NumPy's numbers, as Python's."""
     if isinstance(value, np.generic):
         return value.item()
-    raise TypeError(f"{type(value).__name__} is not JSON")
+    raise TypeError(f"it is a {type(value).__name__}, not plain values")
 
 
 def head_name(policies: Mapping[str, type[BasePolicy]]) -> str:

@@ -108,7 +108,7 @@ class FinetunedDTFM(SequenceModel):
         :raises ValueError: an actor that cannot be taken over
         """
         file = io.BytesIO()
-        model.save(file)
+        model.save(file, exclude=set(vars(model)) - cls._saved_names())  # of a subclass
         finetuned = cls.load(file, device=model.device)
         finetuned.policy.optimizer.state.clear()  # it learns no more: half of the file
         if agent is not None:

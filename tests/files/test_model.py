@@ -23,6 +23,7 @@ from sb3_dtfm.algorithms.loading import SAVED
 from sb3_dtfm.algorithms.model import ACCEPTED
 from sb3_dtfm.algorithms.options import TrainingOptions
 from sb3_dtfm.files import ModelFileError
+from sb3_dtfm.finetuning import FinetunedDTFM
 from tests.algorithms.small import make_model
 from tests.conftest import make_env
 from tests.timing import takes_less
@@ -106,7 +107,6 @@ def refused(content: bytes, tmp_path: Path) -> str:
 @pytest.mark.parametrize("algorithm", [DT, DTFM])
 def test_all_that_training_changes_comes_back(algorithm, cheetah_buffer, tmp_path):
     model = make_model(algorithm, cheetah_buffer, ema_decay=0.9, learning_rate=LinearSchedule(1e-3, 1e-4, 0.5))
-    model.note = {"of": ["the user's", 1, None]}
     model.learn(3).save(tmp_path / "model")
     loaded = algorithm.load(tmp_path / "model")
     ours, theirs = (each.get_parameters()["policy"] for each in (model, loaded))
@@ -116,7 +116,7 @@ def test_all_that_training_changes_comes_back(algorithm, cheetah_buffer, tmp_pat
     assert ours["state"].keys() == theirs["state"].keys()
     assert all(th.equal(value, theirs["state"][i][name]) for i in ours["state"] for name, value in ours["state"][i].items())
     assert (loaded.observation_space, loaded.action_space) == (model.observation_space, model.action_space)
-    assert (loaded.num_timesteps, loaded._n_updates, loaded.note) == (3, 3, model.note)
+    assert (loaded.num_timesteps, loaded._n_updates) == (3, 3)
     assert [loaded.lr_schedule(x) for x in (1.0, 0.9, 0.2)] == [model.lr_schedule(x) for x in (1.0, 0.9, 0.2)]
     assert vars(loaded).keys() == vars(model).keys() - {"_logger"}
 
@@ -148,12 +148,34 @@ def test_a_function_for_the_learning_rate_is_asked_for_again(cheetah_buffer, tmp
 
 def test_what_cannot_be_saved_is_left_out_aloud_or_refused_if_asked_for(cheetah_buffer, tmp_path):
     model = make_model(DT, cheetah_buffer)
-    model.handle = lambda: None
-    with pytest.warns(UserWarning, match="handle is no part of a saved model"):
+    model.note = {"of": ["the user's", 1, None]}
+    model.controller = {"handle": lambda: None}
+    with pytest.warns(UserWarning, match="is no part of a saved model") as warned:
         model.save(tmp_path / "model")
-    with pytest.raises(ValueError, match="buffer is no part of a saved model"):
-        model.save(tmp_path / "other", include=["buffer"], exclude=["handle"])
+    about = sorted(str(each.message) for each in warned)
+    assert "controller is no part of a saved model: it is a function, not plain values" in about[0]
+    assert "note is no part of a saved model: no model has such an attribute" in about[1]
+    for name in ("buffer", "note", "controller"):
+        with pytest.raises(ValueError, match=f"{name} is no part of a saved model"):
+            model.save(tmp_path / "other", include=[name], exclude={"note", "controller"} - {name})
     assert [path.name for path in tmp_path.iterdir()] == ["model.zip"]
+    loaded = DT.load(tmp_path / "model")
+    assert (hasattr(loaded, "note"), loaded.controller) == (False, None)
+
+
+def test_arguments_of_a_subclass_come_back_to_it_alone(cheetah_buffer, tmp_path):
+    class Own(DTFM):
+        def __init__(self, *args, bonus: float = 0.0, **kwargs):
+            self.bonus = bonus
+            super().__init__(*args, **kwargs)
+
+    model = Own("MlpPolicy", dataset=cheetah_buffer, policy_kwargs=dict(embed_dim=8, n_layers=1), device="cpu", bonus=0.5)
+    model.save(tmp_path / "model")
+    assert Own.load(tmp_path / "model").bonus == 0.5
+    with pytest.raises(ModelFileError, match="'bonus' is no attribute that a DTFM is saved with"):
+        DTFM.load(tmp_path / "model")
+    assert DTFM.load(tmp_path / "model", custom_objects={"bonus": None}).bonus is None
+    assert FinetunedDTFM.of(model).policy.action_space == model.action_space
 
 
 def test_a_policy_of_ones_own_is_asked_for(cheetah_buffer, tmp_path):
@@ -207,8 +229,7 @@ def test_a_pickle_hidden_in_a_file_of_ours_is_not_opened(where, saved, tmp_path)
         configuration = json.loads(parts["model.json"])
         configuration["attributes"]["note"] = {":type:": "x", ":serialized:": pickle.dumps(RunsCode()).hex()}
         parts["model.json"] = json.dumps(configuration).encode()
-        (tmp_path / "model.zip").write_bytes(packed(parts))
-        DTFM.load(tmp_path / "model.zip")
+        assert "'note' is no attribute" in refused(packed(parts), tmp_path)
     else:
         assert where in refused(packed({**parts, where: pickle.dumps(RunsCode())}), tmp_path)
     assert RAN == []
@@ -251,6 +272,9 @@ BAD_CONFIGURATIONS = [
     (("attributes", "num_timesteps"), 10**400, "num_timesteps must be"),
     (("attributes", "dataset"), "evil.npz", "'dataset' is no attribute"),
     (("attributes", "tensorboard_log"), "/etc", "'tensorboard_log' is no attribute"),
+    (("attributes", "note"), "plain", "'note' is no attribute"),
+    (("attributes", "_init_setup_model"), True, "'_init_setup_model' is no attribute"),
+    (("attributes", "args"), [], "'args' is no attribute"),
     (("attributes", "__class__"), 1, "'__class__' is no attribute"),
     (("attributes", "\x1b[2J"), 1, r"'\x1b[2J' is no attribute"),
     (("attributes", "n_envs"), 10**12, "n_envs must be"),
