@@ -2,7 +2,6 @@
 The rows of `make baselines` as a table: success in percent or return, mean over seeds and its 95 % interval (Student's t).
 
     PYTHONPATH=studies python -m baselines.table results/baselines.csv           # a line for each dataset and algorithm
-    PYTHONPATH=studies python -m baselines.table results/baselines.csv --short   # a line for each dataset
     PYTHONPATH=studies python -m baselines.table results/baselines.csv --suite results/suite.csv   # and our defaults
 """
 
@@ -73,47 +72,33 @@ def long_table(folder: Path) -> Iterable[Sequence[str]]:
                 )
 
 
-def short_table(folder: Path) -> Iterable[Sequence[str]]:
-    """Lines of results alone, the largest mean in bold."""
-    grouped, datasets, algorithms = read(folder)
-    yield "data", *algorithms
-    for name in datasets:
-        runs = {algo: grouped[name, algo] for algo in algorithms if (name, algo) in grouped}
-        means = {algo: float(np.mean([run.value("final") for run in each])) for algo, each in runs.items()}
-        bold = {algo: "**" if mean == max(means.values()) else "" for algo, mean in means.items()}
-        yield name, *(f"{bold[algo]}{result(runs[algo])}{bold[algo]}" if algo in runs else NONE for algo in algorithms)
-
-
 def suite_table(folder: Path, suite: Path) -> Iterable[Sequence[str]]:
-    """Lines of DT and DTFM by the classes' defaults, and of the best other algorithm."""
+    """Lines of DT and DTFM by the classes' defaults and of the other algorithms, the best of which has its interval."""
     grouped, datasets, algorithms = read(folder)
     defaults: Grouped = {}
     for group in (group for study in read_studies([suite]) for group in study.groups):
         for (task, _, algo), runs in group.runs.items():
             defaults.setdefault((task, algo), []).extend(runs)
-    yield "data", "DT", "DTFM", "best of the others"
+    others = [algo for algo in algorithms if algo.partition(",")[0] not in ALGORITHMS]
+    yield "data", "DT", "DTFM", *others
     for name in datasets:
         ours = [defaults.get((IN_SUITE.get(name, name), algo)) for algo in ("dt", "dtfm")]
         if not any(ours):
             continue
-        others = {
-            algo: grouped[name, algo]
-            for algo in algorithms
-            if algo.partition(",")[0] not in ALGORITHMS and (name, algo) in grouped
-        }
-        best = max(others, key=lambda algo: float(np.mean([run.value("final") for run in others[algo]])))
-        yield name, *(result(runs) if runs else NONE for runs in ours), f"{best}: {result(others[best])}"
+        theirs = {algo: result(grouped[name, algo]) for algo in others if (name, algo) in grouped}
+        best = max(theirs, key=lambda algo: float(np.mean([run.value("final") for run in grouped[name, algo]])))
+        cells = {algo: each if algo == best else each.partition(" [")[0] for algo, each in theirs.items()}
+        yield name, *(result(runs) if runs else NONE for runs in ours), *(cells.get(algo, NONE) for algo in others)
 
 
 def main() -> None:
     """See the top."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--short", action="store_true")
     parser.add_argument("--suite", type=Path, metavar="FOLDER", help="rows of studies/suite.yml")
     options = parser.parse_args()
     folder = options.folder
-    table = suite_table(folder, options.suite) if options.suite else (short_table if options.short else long_table)(folder)
+    table = suite_table(folder, options.suite) if options.suite else long_table(folder)
     header, *lines = table
     for line in (header, ["---"] * len(header), *lines):
         print(f"| {' | '.join(line)} |")
