@@ -21,6 +21,7 @@ from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.evaluation import FINAL_STATES, evaluate, make_seeded_envs
 from sb3_dtfm.benchmark.rows import read_rows, write_row
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer, load_dataset
+from sb3_dtfm.envs import register_gymnasium_robotics
 from sb3_dtfm.zoo.arguments import UsageError
 
 ROOT = Path(__file__).parents[2]
@@ -286,6 +287,7 @@ def test_a_dataset_that_is_missing_is_named_with_where_its_recipe_is(tmp_path, d
 
 
 def test_every_dataset_of_the_comparison_is_a_task_with_settings_for_us_and_for_its_baselines():
+    register_gymnasium_robotics()
     for name, data in entries.read_entries(ROOT / "studies" / "baselines.yml", entries.Data).items():
         assert data.kind in entries.KINDS, name
         assert data.baselines.keys() <= OTHERS.keys(), name
