@@ -14,20 +14,17 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from sb3_dtfm.actions import ActionSpace, unscaled
 from sb3_dtfm.data.arrays import NUMBERS_EXPECTED
 from sb3_dtfm.data.buffer import TrajectoryBuffer
+from sb3_dtfm.data.ends import DONES, TERMINATIONS, TRUNCATIONS, told_flags
 from sb3_dtfm.data.flat import (
     ACTIONS,
-    DONES,
     OBSERVATIONS,
     REWARDS,
     SUCCESSES,
-    TERMINATIONS,
-    TRUNCATIONS,
     bounded_space,
     check_shape,
     explain_range,
     fitted,
     load_flat,
-    told_flags,
     warn_of_made_up_rewards,
 )
 from sb3_dtfm.data.observations import chosen_space, observed

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from sb3_dtfm.data.flat import ACTIONS, DONES, OBSERVATIONS, REWARDS, TERMINATIONS, TRUNCATIONS, holds_episodes
+from sb3_dtfm.data.ends import DONES, TERMINATIONS, TRUNCATIONS
+from sb3_dtfm.data.flat import ACTIONS, OBSERVATIONS, REWARDS, holds_episodes
 from sb3_dtfm.data.trajectories import DatasetError
 from sb3_dtfm.envs.success import reported_success
 

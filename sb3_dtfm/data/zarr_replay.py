@@ -18,21 +18,17 @@ from gymnasium import spaces
 from sb3_dtfm.actions import ActionSpace
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, existing_file, files_below
+from sb3_dtfm.data.ends import DONES, EPISODES, TERMINATIONS, TRUNCATIONS, told_flags
 from sb3_dtfm.data.flat import (
     ACTIONS,
-    DONES,
-    EPISODES,
     NOT_NEEDED,
     OBSERVATIONS,
     REWARDS,
     SUCCESSES,
-    TERMINATIONS,
-    TRUNCATIONS,
     bounded_space,
     explain_range,
     fitted,
     json_options,
-    told_flags,
     warn_of_made_up_rewards,
 )
 from sb3_dtfm.data.observations import observed
