@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from sb3_dtfm.zoo.arguments import check_algorithm, import_packages
+from sb3_dtfm.zoo.arguments import check_algorithm, check_env_id, import_packages
 from sb3_dtfm.zoo.registration import register
 from sb3_dtfm.zoo.video import FORMATS, add_model_arguments, chosen_model, film, models_of_training
 
@@ -27,6 +27,7 @@ def main(argv: Sequence[str]) -> None:
     options, others = _parser().parse_known_args(argv)
     register()
     check_algorithm(options.algo)
+    check_env_id(options.env.gym_id)
     import_packages(options.gym_packages)
     model = chosen_model(options)
     run = Path(model.run)

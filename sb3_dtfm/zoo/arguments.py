@@ -276,6 +276,7 @@ def train_arguments(argv: Sequence[str]) -> list[str]:
     """
     options, rest = train_parser().parse_known_args(argv)
     check_algorithm(options.algo)
+    check_env_id(options.env)
     if options.algo == FINETUNED:
         raise UsageError(f"--algo {FINETUNED}: such models come from `sb3-dtfm finetune`; `enjoy` plays them.")
     if options.dataset_fraction is not None and not 0.0 < options.dataset_fraction <= 1.0:
@@ -311,6 +312,16 @@ def check_algorithm(algo: str) -> None:
     if algo not in known:
         nearest = with_nearest([algo.lower()], known).replace(algo.lower(), algo, 1)
         raise UsageError(f"--algo {nearest}: expected one of {', '.join(known)}.")
+
+
+def check_env_id(env_id: str | None) -> None:
+    """
+    :param env_id: Gymnasium id, None where RL-Zoo has a default
+    :raises UsageError: names a module, too, which RL-Zoo does not import
+    """
+    module, colon, name = (env_id or "").partition(":")
+    if colon:
+        raise UsageError(f"--env {env_id}: expected an id without its module: --gym-packages {module} --env {name}.")
 
 
 def check_device(device: str | th.device) -> None:
@@ -401,6 +412,7 @@ def enjoy_parser() -> argparse.ArgumentParser:
     offline("--target-return", type=float, help="in reward units; the run's by default")
     shared = parser.add_argument_group("read on the way to RL-Zoo").add_argument
     shared("--algo", default="ppo", help=argparse.SUPPRESS)
+    shared("--env", help=argparse.SUPPRESS)
     shared("-f", "--folder", help=argparse.SUPPRESS)
     shared("--device", help=argparse.SUPPRESS)
     shared("--gym-packages", nargs="+", default=[], help=argparse.SUPPRESS)
@@ -418,6 +430,7 @@ def enjoy_arguments(argv: Sequence[str]) -> tuple[float | None, list[str]]:
     """
     options, rest = enjoy_parser().parse_known_args(argv)
     check_algorithm(options.algo)
+    check_env_id(options.env)
     check_device(options.device or "auto")
     import_packages(options.gym_packages)
     ours = options.algo in (*ALGORITHMS, FINETUNED)
@@ -425,6 +438,14 @@ def enjoy_arguments(argv: Sequence[str]) -> tuple[float | None, list[str]]:
         raise UsageError(f"--target-return: for --algo {' and '.join(ALGORITHMS)} only, not for {options.algo}.")
     folder = options.folder or ("logs" if ours else None)
     with_target_return(options.target_return, None)  # refuses what is none
-    device = ["--device", options.device] if options.device else []
-    arguments = ["--algo", options.algo, *rest, *device, *_packages(options), *(["--folder", folder] if folder else [])]
+    env, device = ([f"--{name}", vars(options)[name]] if vars(options)[name] else [] for name in ("env", "device"))
+    arguments = [
+        "--algo",
+        options.algo,
+        *env,
+        *rest,
+        *device,
+        *_packages(options),
+        *(["--folder", folder] if folder else []),
+    ]
     return options.target_return, arguments

@@ -392,13 +392,19 @@ RUNS_NOTHING = {
     ),
     "benchmark, a pickle": (["benchmark", "--dataset", "HalfCheetah-v5=evil.pkl"], "evil.pkl"),
     "benchmark, a pickle that is allowed": (["benchmark", "--datasets", "pickled.yml"], "allow_pickle is accepted by"),
-    "train --env MODULE:ID": ([*DTFM_TRAINING, "--env", f"{PLANTED}:HalfCheetah-v5"], "not found in gym registry"),
+    "train --env MODULE:ID": (
+        [*DTFM_TRAINING, "--env", f"{PLANTED}:HalfCheetah-v5"],
+        f"--gym-packages {PLANTED} --env HalfCheetah-v5",
+    ),
     "finetune --env MODULE:ID": (
         [*COMMANDS["finetune"], "--env", f"{PLANTED}:HalfCheetah-v5"],
         "not found in gym registry",
     ),
     **{
-        f"{command} --env MODULE:ID": ([*COMMANDS[command], "--env", f"{PLANTED}:HalfCheetah-v5"], f"KeyError('{PLANTED}:")
+        f"{command} --env MODULE:ID": (
+            [*COMMANDS[command], "--env", f"{PLANTED}:HalfCheetah-v5"],
+            f"--gym-packages {PLANTED} --env HalfCheetah-v5",
+        )
         for command in ("enjoy", "video")
     },
     "benchmark --env MODULE:ID": (["benchmark", "--env", f"{PLANTED}:HalfCheetah-v5"], "planted_module"),
