@@ -1,7 +1,7 @@
 """
-The rows of `make baselines` as a picture: each algorithm's mean, as a share of the best one's on the same data.
+DT and DTFM by the defaults and the rows of `make baselines` as a picture: means, as shares of the best one on the same data.
 
-    PYTHONPATH=studies python -m baselines.figure results/baselines.csv docs/studies/baselines.png
+    PYTHONPATH=studies python -m baselines.figure results/baselines.csv results/suite.csv docs/studies/baselines.png
 """
 
 import argparse
@@ -13,10 +13,10 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from baselines.table import Grouped, read
+from baselines.table import Grouped, compared
 
 # Ours in colours of their own, the others in grey shapes.
-OURS = {"dt": ("DT", "D", "C1"), "dtfm": ("DTFM", "o", "C0"), "dtfm, best-of-n": ("DTFM, best-of-N", "*", "C3")}
+OURS = {"dt": ("DT", "D", "C1"), "dtfm": ("DTFM", "o", "C0")}
 OTHERS = {
     "d3rlpy-dt": ("d3rlpy's DT", "s"),
     "bc": ("BC", "v"),
@@ -28,12 +28,13 @@ OTHERS = {
 }
 
 
-def plot(folder: Path, output: Path) -> None:
+def plot(folder: Path, suite: Path, output: Path) -> None:
     """
-    :param folder: of rows
+    :param folder: of the other algorithms' rows
+    :param suite: of the defaults' rows
     :param output: the PNG
     """
-    grouped, datasets, _ = read(folder)
+    grouped, datasets, _ = compared(folder, suite)
     figure = Figure(figsize=(9.0, 0.42 * len(datasets) + 1.0), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
@@ -73,10 +74,10 @@ def _best(grouped: Grouped, name: str, algos: Iterable[str]) -> float:
 def main() -> None:
     """See the top."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("output", type=Path)
+    for name in ("folder", "suite", "output"):
+        parser.add_argument(name, type=Path)
     options = parser.parse_args()
-    plot(options.folder, options.output)
+    plot(options.folder, options.suite, options.output)
 
 
 if __name__ == "__main__":

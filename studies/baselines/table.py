@@ -6,6 +6,7 @@ The rows of `make baselines` as a table: success in percent or return, mean over
 """
 
 import argparse
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -72,23 +73,33 @@ def long_table(folder: Path) -> Iterable[Sequence[str]]:
                 )
 
 
-def suite_table(folder: Path, suite: Path) -> Iterable[Sequence[str]]:
-    """Lines of DT and DTFM by the classes' defaults and of the other algorithms, the best of which has its interval."""
+def compared(folder: Path, suite: Path) -> tuple[Grouped, list[str], list[str]]:
+    """As :func:`read`, with DT and DTFM by the classes' defaults, on the datasets that these have learned from."""
     grouped, datasets, algorithms = read(folder)
+    others = [algo for algo in algorithms if algo.partition(",")[0] not in ALGORITHMS]
     defaults: Grouped = {}
     for group in (group for study in read_studies([suite]) for group in study.groups):
         for (task, _, algo), runs in group.runs.items():
             defaults.setdefault((task, algo), []).extend(runs)
-    others = [algo for algo in algorithms if algo.partition(",")[0] not in ALGORITHMS]
-    yield "data", "DT", "DTFM", *others
+    found = {(name, algo): runs for (name, algo), runs in grouped.items() if algo in others}
+    for name, algo in itertools.product(datasets, ALGORITHMS):
+        if runs := defaults.get((IN_SUITE.get(name, name), algo)):
+            found[name, algo] = runs
+    ours = [name for name in datasets if any((name, algo) in found for algo in ALGORITHMS)]
+    return found, ours, [*ALGORITHMS, *others]
+
+
+def suite_table(folder: Path, suite: Path) -> Iterable[Sequence[str]]:
+    """Lines of DT and DTFM by the classes' defaults and of the other algorithms, the best of which has its interval."""
+    grouped, datasets, algorithms = compared(folder, suite)
+    yield "data", *(algo.upper() if algo in ALGORITHMS else algo for algo in algorithms)
     for name in datasets:
-        ours = [defaults.get((IN_SUITE.get(name, name), algo)) for algo in ("dt", "dtfm")]
-        if not any(ours):
-            continue
-        theirs = {algo: result(grouped[name, algo]) for algo in others if (name, algo) in grouped}
-        best = max(theirs, key=lambda algo: float(np.mean([run.value("final") for run in grouped[name, algo]])))
-        cells = {algo: each if algo == best else each.partition(" [")[0] for algo, each in theirs.items()}
-        yield name, *(result(runs) if runs else NONE for runs in ours), *(cells.get(algo, NONE) for algo in others)
+        found = {algo: grouped[name, algo] for algo in algorithms if (name, algo) in grouped}
+        others = [algo for algo in found if algo not in ALGORITHMS]
+        best = max(others, key=lambda algo: float(np.mean([run.value("final") for run in found[algo]])))
+        cells = {algo: result(runs) for algo, runs in found.items()}
+        cells |= {algo: cells[algo].partition(" [")[0] for algo in others if algo != best}
+        yield name, *(cells.get(algo, NONE) for algo in algorithms)
 
 
 def main() -> None:
