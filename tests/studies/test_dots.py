@@ -1,0 +1,62 @@
+"""A picture shows the numbers of a page's table."""
+
+from pathlib import Path
+
+import dots
+import pytest
+from matplotlib.axes import Axes
+
+PAGE = """# A study
+
+Text.
+
+| data | recorded, % | DT | [DTFM](x.md) |
+| --- | --- | --- | --- |
+| `door` | 96 | 5,100, 99, -2 | 0.5 [0.25, 1] |
+| ... nothing | | - | |
+| half | | 39 to 47 | 4 * |
+
+| another | table |
+| --- | --- |
+| 1 | 2 |
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "values", "interval"),
+    [
+        ("4, 5, 6", [4, 5, 6], None),
+        ("5,100, 99, -2", [5100, 99, -2], None),
+        ("1,322 [1,083, 1,562]", [1322], (1083, 1562)),
+        ("0.941 [0.929, 0.953]", [0.941], (0.929, 0.953)),
+        ("96; 95; 79", [96, 95, 79], None),
+        ("70 *", [70], None),
+        ("", [], None),
+        ("-", [], None),
+    ],
+)
+def test_numbers_of_a_cell(text, values, interval):
+    assert dots.read_cell(text) == (values, interval)
+
+
+def test_a_picture_has_a_dot_for_each_number_of_the_columns_and_no_line_without_any(tmp_path, monkeypatch):
+    drawn, ticks = [], []
+    plot, set_yticks = Axes.plot, Axes.set_yticks
+    monkeypatch.setattr(
+        Axes, "plot", lambda self, x, y, *a, **k: drawn.append((list(x), list(y))) or plot(self, x, y, *a, **k)
+    )
+    monkeypatch.setattr(Axes, "set_yticks", lambda self, at, names: ticks.extend(names) or set_yticks(self, at, names))
+    page = tmp_path / "page.md"
+    page.write_text(PAGE)
+    assert dots.draw(page, ["DT", "DTFM"], "solved") == tmp_path / "page.png"
+    assert (tmp_path / "page.png").stat().st_size > 5_000
+    assert ticks == ["door", "half"]
+    assert [x for x in drawn if x] == [[5100, 99, -2], [39, 47], [0.5], [0.25, 1], [4]]
+
+
+@pytest.mark.parametrize("name", ["adroit", "expected-returns", "ogbench", "pusht"])
+def test_pages_have_tables_and_pictures(name):
+    page = Path(__file__).parents[2] / "docs" / "studies" / f"{name}.md"
+    assert f"({name}.png)" in page.read_text()
+    assert len(dots.read_table(page)) > 5
+    assert f"docs/studies/{name}.md" in dots.__doc__
