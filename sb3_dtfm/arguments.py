@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import inspect
+import itertools
 import math
 import numbers
 import re
@@ -78,6 +79,43 @@ class Rule(Protocol):
     def accepts(self, value: Any) -> bool:
         """Return whether a value is one of them."""
         ...
+
+
+class Listed(NamedTuple):
+    """
+    A list of numbers, or of lists of them.
+
+    :param rule: of each number
+    :param length: of the list, None for any
+    :param nested: an entry may be such a list of any length
+    """
+
+    rule: Rule
+    length: int | None = None
+    nested: bool = False
+
+    def accepts(self, value: Any) -> bool:
+        """Return whether a value is such a list, or None."""
+        if value is None:
+            return True
+        if not isinstance(value, list) or self.length not in (None, len(value)):
+            return False
+        entries = (each if self.nested and isinstance(each, list) else [each] for each in value)
+        return all(map(self.rule.accepts, itertools.chain.from_iterable(entries)))
+
+    def __str__(self) -> str:
+        return f"a list of {self.length or 'any number of'} entries, each {self.rule}, or None"
+
+
+class Text:
+    """Text without control characters."""
+
+    def accepts(self, value: Any) -> bool:
+        """Return whether a value is such a text, or None."""
+        return value is None or (isinstance(value, str) and value.isprintable())
+
+    def __str__(self) -> str:
+        return "text, or None"
 
 
 BOOLEAN = Choice((True, False))

@@ -18,6 +18,7 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_dtfm.data.trajectories import ScoreReference
+from sb3_dtfm.files import printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -219,7 +220,7 @@ class NormalizedScoreCallback(BaseCallback):
             reference = self.score_reference
             print(
                 f"eval/normalized_score: 0 is a return of {reference.minimum:.1f}, 1 is {reference.maximum:.1f} "
-                f"({reference.scale})"
+                f"({printable(reference.scale)})"
             )
         self._log_new_evaluations()
 

@@ -27,7 +27,7 @@ PARTS = {
     "data": ("sb3_dtfm/data", {"actions", "arguments", "data", "envs", "files", "transitions", "windows"}),
     "recording": ("sb3_dtfm/recording", {"recording", "actions", "algorithms", "envs", "data", "files", "finetuning"}),
     "policies": ("sb3_dtfm/policies", {"networks", "heads", "transitions", "windows", "actions", "arguments", "policies"}),
-    "callbacks": ("sb3_dtfm/callbacks.py", {"data"}),
+    "callbacks": ("sb3_dtfm/callbacks.py", {"data", "files"}),
     "optimization": ("sb3_dtfm/optimization.py", set()),
     "distributed": ("sb3_dtfm/distributed.py", {"windows"}),
     "algorithms": (

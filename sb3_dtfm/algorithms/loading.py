@@ -13,9 +13,9 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_dtfm.algorithms.saving import (
+    DATASET_OPTIONS,
     ENCODED,
     EXTRACTOR_KWARGS,
-    NEVER_SAVED,
     OPTIMIZER,
     POLICY,
     SPACES,
@@ -24,7 +24,7 @@ from sb3_dtfm.algorithms.saving import (
     head_name,
     optimizers,
 )
-from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, Choice, Number, Rule, check_arguments
+from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, Choice, Listed, Number, Rule, Text, check_arguments
 from sb3_dtfm.data import ReturnReference, check_action_space
 from sb3_dtfm.data.readers import check_options
 from sb3_dtfm.envs import OBSERVATION, RETURN_TO_GO, TIMESTEP, image_spaces
@@ -41,8 +41,8 @@ SAVED: dict[str, Rule] = {
     "_n_updates": WHOLE,
     "_episode_num": WHOLE,
     "_n_left": WHOLE,
-    "n_episodes": COUNT,
-    "gradient_steps": COUNT,
+    "n_episodes": Number(low=1, high=2**31, whole=True),
+    "gradient_steps": Number(low=1, high=2**31, whole=True),
     "start_time": NOT_NEGATIVE,
     "n_envs": Number(low=1, high=2**16, whole=True),
     "max_timestep": COUNT,
@@ -57,6 +57,15 @@ SAVED: dict[str, Rule] = {
 }
 # Attributes of several values, each with a check of its own.
 STRUCTURED = {"policy_kwargs", "dataset_kwargs", "score_reference", "return_reference", "controller", "online_actor"}
+# Options of single readers.
+READER_OPTIONS: dict[str, Rule] = {
+    "env_id": Text(),
+    "filter_key": Text(),
+    "on_invalid": Choice(("raise", "drop")),
+    "episodes": Listed(WHOLE),
+    "image_size": Listed(COUNT, 2),
+    "action_bounds": Listed(Number(), 2, nested=True),
+}
 # Values of a ReturnReference, in its order.
 RETURN_REFERENCE: tuple[Rule, ...] = (
     *(Number(), Number(), Number(), COUNT, BOOLEAN),
@@ -172,21 +181,19 @@ def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
     extractor = attributes.get("policy_kwargs", {}).get(EXTRACTOR_KWARGS)
     if isinstance(extractor, dict) and WEIGHTS in extractor:
         raise ModelFileError(f"{source}: {EXTRACTOR_KWARGS} name a file of {WEIGHTS}, which no saved model needs.")
-    dataset_kwargs = attributes.get("dataset_kwargs") or {}
-    if not isinstance(dataset_kwargs, dict) or set(NEVER_SAVED) & set(dataset_kwargs):
-        expected = f"arguments by name, without {' and '.join(NEVER_SAVED)}"
-        raise ModelFileError(f"{source}: dataset_kwargs are {dataset_kwargs!r}, expected {expected}.")
-    with wrap_file_errors(f"{source}: dataset_kwargs"):
-        check_options(dataset_kwargs)
+    _check_dataset_kwargs(attributes.get("dataset_kwargs"), f"{source}: dataset_kwargs")
     reference = attributes.get("score_reference")
     kinds = [type(each) for each in reference] if isinstance(reference, list) else reference
-    if kinds not in (None, [float, float, str]) or (reference and not reference[0] < reference[1]):
+    told = kinds == [float, float, str] and reference[0] < reference[1] and Text().accepts(reference[2])
+    if reference is not None and not told:
         raise ModelFileError(f"{source}: score_reference is {reference}, expected two returns and where they come from.")
     returns: Any = attributes.get("return_reference")
     known = isinstance(returns, list) and len(returns) == len(RETURN_REFERENCE)
     accepted = known and all(rule.accepts(value) for rule, value in zip(RETURN_REFERENCE, returns, strict=True))
     if returns is not None and not accepted:
         raise ModelFileError(f"{source}: return_reference is {returns}, expected {', '.join(ReturnReference._fields)}.")
+    if not isinstance(actor := attributes.get("online_actor"), dict | None):
+        raise ModelFileError(f"{source}: online_actor is {actor!r:.40}, expected its settings, or None.")
     if not isinstance(controller := attributes.get("controller"), dict | None):
         raise ModelFileError(f"{source}: controller is {controller!r:.40}, expected settings by robosuite's names, or None.")
     with wrap_file_errors(source):
@@ -199,6 +206,19 @@ def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
         raise ModelFileError(f"{source}: observation_space is {observation}, not what a ReturnToGoWrapper observes.")
     with wrap_file_errors(source):
         check_action_space(action, "action_space")
+
+
+def _check_dataset_kwargs(given: Any, where: str) -> None:
+    """Check options of `load_dataset`, whose own checks come when data are read."""
+    if given is None:
+        return
+    if not isinstance(given, dict):
+        raise ModelFileError(f"{where} are {given!r:.40}, expected arguments by name, or None.")
+    for name in given.keys() - set(DATASET_OPTIONS):
+        raise ModelFileError(f"{where}: {name!r:.40} is no option in a file; accepted: {', '.join(DATASET_OPTIONS)}.")
+    with wrap_file_errors(where):
+        check_options(given)
+        check_arguments(given, {name: rule for name, rule in READER_OPTIONS.items() if name in given})
 
 
 def _space(described: str, what: str) -> spaces.Space:

@@ -2,10 +2,12 @@
 
 import inspect
 import io
+import itertools
 from collections.abc import Iterable
 from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
+from types import FunctionType
 from typing import Any, TypeVar
 
 import gymnasium as gym
@@ -55,6 +57,9 @@ ACCEPTED: dict[str, Rule] = {
     "seed": Number(low=0, high=2**32 - 1, whole=True, optional=True),
     "target_return": Number(optional=True),
 }
+
+# Attributes of all models that a file may hold.
+KNOWN = {*SAVED, *STRUCTURED, *ACCEPTED, *TrainingOptions.__dataclass_fields__}
 
 SelfModel = TypeVar("SelfModel", bound="SequenceModel")
 
@@ -333,9 +338,9 @@ class SequenceModel(BaseAlgorithm):
                 f"{source} is a fine-tuned DTFM: sb3_dtfm.finetuning.FinetunedDTFM loads it. To go on learning, `sb3-dtfm "
                 "finetune -i` takes the agent.zip beside it, and --model the DTFM that it began with."
             )
-        accepted = (cls._saved_names() | ENCODED) - set(model._excluded_save_params()) | set(custom_objects)
+        accepted = model._saved_names() | ENCODED | set(custom_objects)
         for name in attributes:
-            if name not in accepted or hasattr(cls, name):
+            if name not in accepted:
                 raise ModelFileError(f"{source}: {name!r} is no attribute that a {cls.__name__} is saved with.")
         vars(model).update(attributes)
         known = {*vars(model), *inspect.signature(cls).parameters}
@@ -439,12 +444,14 @@ class SequenceModel(BaseAlgorithm):
         settings = {**about, "env_id": env_id, "target_return": target_return, **exported.settings}
         write_onnx(path, exported, exported.example(), exported.outputs, settings)
 
-    @classmethod
-    def _saved_names(cls) -> set[str]:
-        """Attributes that a file may set: this package's, and of a subclass those that its constructor takes."""
-        given = inspect.signature(cls).parameters.values()
+    def _saved_names(self) -> set[str]:
+        """Attributes that a file may hold: this package's, and of a subclass those that constructors take."""
+        classes = (each for each in type(self).__mro__ if issubclass(each, SequenceModel) and each is not SequenceModel)
+        given = itertools.chain.from_iterable(inspect.signature(each).parameters.values() for each in classes)
         arguments = {each.name for each in given if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)}
-        return {*SAVED, *STRUCTURED, *ACCEPTED, *TrainingOptions.__dataclass_fields__, *arguments} - {"_init_setup_model"}
+        own = {name: inspect.getattr_static(self, name, None) for name in arguments}
+        methods = {name for name, value in own.items() if isinstance(value, property | FunctionType)}
+        return (KNOWN | arguments) - {"_init_setup_model", *methods, *self._excluded_save_params()}
 
     def _excluded_save_params(self) -> list[str]:
         of_an_environment = [

@@ -25,8 +25,11 @@ SPACES = ("observation_space", "action_space")
 ENCODED = {*SPACES, "policy_class", "learning_rate", "_means"}
 
 
-# Options of `dataset_kwargs` that only the loading user may choose: where a cache lies and whether a pickle may run.
-NEVER_SAVED = ("cache_dir", "allow_pickle")
+# Options of `dataset_kwargs` that a file may hold; the loading user says where a cache lies and whether a pickle may run.
+DATASET_OPTIONS = (
+    *("env_id", "max_episode_steps", "min_return", "best_share", "success_only", "fraction", "fraction_seed", "on_invalid"),
+    *("observation_keys", "action_keys", "action_bounds", "clip_actions", "filter_key", "episodes", "image_size"),
+)
 # `weights` among `features_extractor_kwargs` is a file that only the first training needs.
 EXTRACTOR, EXTRACTOR_KWARGS, WEIGHTS = "features_extractor_class", "features_extractor_kwargs", "weights"
 
@@ -68,7 +71,7 @@ def to_configuration(
     """
     attributes = {name: value for name, value in vars(model).items() if name not in {*left_out, *ENCODED}}
     if attributes.get("dataset_kwargs"):
-        kept = {name: value for name, value in attributes["dataset_kwargs"].items() if name not in NEVER_SAVED}
+        kept = {name: value for name, value in attributes["dataset_kwargs"].items() if name in DATASET_OPTIONS}
         attributes["dataset_kwargs"] = kept
     if "policy_kwargs" in attributes:
         attributes["policy_kwargs"] = _without_weights(attributes["policy_kwargs"])

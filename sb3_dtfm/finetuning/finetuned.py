@@ -11,7 +11,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import GymEnv
 from torch import nn
 
-from sb3_dtfm.algorithms.model import POLICY_NAMES, SequenceModel
+from sb3_dtfm.algorithms.model import KNOWN, POLICY_NAMES, SequenceModel
 from sb3_dtfm.algorithms.options import TrainingOptions
 from sb3_dtfm.finetuning.frozen_env import FrozenPolicyVecEnv
 from sb3_dtfm.finetuning.online_actor import (
@@ -108,7 +108,7 @@ class FinetunedDTFM(SequenceModel):
         :raises ValueError: an actor that cannot be taken over
         """
         file = io.BytesIO()
-        model.save(file, exclude=set(vars(model)) - cls._saved_names())  # of a subclass
+        model.save(file, exclude=set(vars(model)) - KNOWN)  # a subclass's own
         finetuned = cls.load(file, device=model.device)
         finetuned.policy.optimizer.state.clear()  # it learns no more: half of the file
         if agent is not None:

@@ -19,7 +19,7 @@ from stable_baselines3.common.save_util import save_to_zip_file
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_dtfm import DT, DTFM
-from sb3_dtfm.algorithms.loading import SAVED
+from sb3_dtfm.algorithms.loading import SAVED, STRUCTURED
 from sb3_dtfm.algorithms.model import ACCEPTED
 from sb3_dtfm.algorithms.options import TrainingOptions
 from sb3_dtfm.files import ModelFileError
@@ -163,19 +163,46 @@ def test_what_cannot_be_saved_is_left_out_aloud_or_refused_if_asked_for(cheetah_
     assert (hasattr(loaded, "note"), loaded.controller) == (False, None)
 
 
-def test_arguments_of_a_subclass_come_back_to_it_alone(cheetah_buffer, tmp_path):
-    class Own(DTFM):
-        def __init__(self, *args, bonus: float = 0.0, **kwargs):
-            self.bonus = bonus
-            super().__init__(*args, **kwargs)
+class Rewarded(DTFM):
+    """A user's, with an argument of its own."""
 
-    model = Own("MlpPolicy", dataset=cheetah_buffer, policy_kwargs=dict(embed_dim=8, n_layers=1), device="cpu", bonus=0.5)
-    model.save(tmp_path / "model")
-    assert Own.load(tmp_path / "model").bonus == 0.5
+    bonus = 0.0
+
+    def __init__(self, *args, bonus: float = 0.0, **kwargs):
+        self.bonus = bonus
+        super().__init__(*args, **kwargs)
+
+
+class Curious(Rewarded):
+    def __init__(self, *args, curiosity: float = 1.0, **kwargs):
+        self.curiosity = curiosity
+        super().__init__(*args, **kwargs)
+
+
+def test_arguments_of_a_subclass_come_back_to_it_alone(cheetah_buffer, tmp_path):
+    kwargs = dict(dataset=cheetah_buffer, policy_kwargs=dict(embed_dim=8, n_layers=1), device="cpu", bonus=0.5)
+    Rewarded("MlpPolicy", **kwargs).save(tmp_path / "model")
+    assert Rewarded.load(tmp_path / "model").bonus == 0.5
+    assert Curious.load(tmp_path / "model").bonus == 0.5
     with pytest.raises(ModelFileError, match="'bonus' is no attribute that a DTFM is saved with"):
         DTFM.load(tmp_path / "model")
     assert DTFM.load(tmp_path / "model", custom_objects={"bonus": None}).bonus is None
+    model = Curious("MlpPolicy", curiosity=2.0, **kwargs)
+    model.save(tmp_path / "curious")
+    loaded = Curious.load(tmp_path / "curious")
+    assert (loaded.bonus, loaded.curiosity) == (0.5, 2.0)
     assert FinetunedDTFM.of(model).policy.action_space == model.action_space
+
+
+@pytest.mark.parametrize("name", ["tensorboard_log", "env", "dataset", "predict", "buffer"])
+def test_what_could_not_be_loaded_is_not_saved(name, cheetah_buffer, tmp_path):
+    model = make_model(DT, cheetah_buffer, env=make_env(), tensorboard_log=str(tmp_path))
+    model.dataset = "somewhere.npz"
+    if not hasattr(model, name) or name == "predict":
+        model.predict = 1
+    with pytest.raises(ValueError, match=f"{name} is no part of a saved model"):
+        model.save(tmp_path / "model", include=[name])
+    assert not (tmp_path / "model.zip").exists()
 
 
 def test_a_policy_of_ones_own_is_asked_for(cheetah_buffer, tmp_path):
@@ -306,8 +333,22 @@ BAD_CONFIGURATIONS = [
     (("attributes", "return_reference"), [1.0, 2.0, 2.0, 3, 0.5, None, None], "expected recorded, best_tenth, best, n_"),
     (("attributes", "controller"), "kp", "controller is 'kp'"),
     (("attributes", "policy_kwargs"), 7, "policy_kwargs"),
-    (("attributes", "dataset_kwargs"), {"cache_dir": "/etc"}, "without cache_dir and allow_pickle"),
-    (("attributes", "dataset_kwargs"), {"allow_pickle": True}, "without cache_dir and allow_pickle"),
+    (("attributes", "dataset_kwargs"), {"cache_dir": "/etc"}, "'cache_dir' is no option in a file"),
+    (("attributes", "dataset_kwargs"), {"allow_pickle": True}, "'allow_pickle' is no option in a file"),
+    (("attributes", "dataset_kwargs"), {"dataset": "/etc/passwd"}, "'dataset' is no option in a file"),
+    (("attributes", "dataset_kwargs"), {"action_space": 5}, "'action_space' is no option in a file"),
+    (("attributes", "dataset_kwargs"), {"env_args": {"a": 1}}, "'env_args' is no option in a file"),
+    (("attributes", "dataset_kwargs"), {"\x1b[2J": 1}, r"'\x1b[2J' is no option in a file"),
+    (("attributes", "dataset_kwargs"), {"filter_key": 5}, "filter_key must be text, or None"),
+    (("attributes", "dataset_kwargs"), {"env_id": "\x1b[2J"}, "env_id must be text, or None"),
+    (("attributes", "dataset_kwargs"), {"on_invalid": "x"}, "on_invalid must be one of raise, drop"),
+    (("attributes", "dataset_kwargs"), {"episodes": [-1]}, "episodes must be a list of any number of entries, each a whole"),
+    (("attributes", "dataset_kwargs"), {"image_size": [84]}, "image_size must be a list of 2 entries"),
+    (("attributes", "dataset_kwargs"), {"action_bounds": "x"}, "action_bounds must be a list of 2 entries"),
+    (("attributes", "dataset_kwargs"), [], "dataset_kwargs are []"),
+    (("attributes", "score_reference"), [0.0, 1.0, "\x1b[2J"], "expected two returns and where they come from"),
+    (("attributes", "n_episodes"), 10**30, "n_episodes must be"),
+    (("attributes", "online_actor"), 5, "online_actor is 5, expected its settings, or None"),
     (("attributes", "dataset_kwargs"), "x", "dataset_kwargs are 'x'"),
     (("attributes", "dataset_kwargs"), {"fraction": "x"}, "dataset_kwargs: fraction must be"),
     (("attributes", "dataset_kwargs"), {"observation_keys": 3}, "observation_keys must be a list of names"),
@@ -405,12 +446,11 @@ def test_a_directory_that_leads_nowhere_is_refused(saved, tmp_path):
 
 def test_each_attribute_in_a_file_has_a_rule(saved):
     """So that no file sets what nobody looks at."""
-    own = {"policy_kwargs", "dataset_kwargs", "score_reference", "return_reference", "controller"}
     assert set(json.loads(members(saved)["model.json"])["attributes"]) <= {
         *SAVED,
         *ACCEPTED,
         *TrainingOptions.defaults(),
-        *own,
+        *STRUCTURED,
     }
 
 
