@@ -182,7 +182,7 @@ def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
     if isinstance(extractor, dict) and WEIGHTS in extractor:
         raise ModelFileError(f"{source}: {EXTRACTOR_KWARGS} name a file of {WEIGHTS}, which no saved model needs.")
     _check_dataset_kwargs(attributes.get("dataset_kwargs"), f"{source}: dataset_kwargs")
-    reference = attributes.get("score_reference")
+    reference: Any = attributes.get("score_reference")
     kinds = [type(each) for each in reference] if isinstance(reference, list) else reference
     told = kinds == [float, float, str] and reference[0] < reference[1] and Text().accepts(reference[2])
     if reference is not None and not told:
