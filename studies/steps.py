@@ -4,7 +4,7 @@ Time that a gradient step takes beside its matrix products alone: docs/performan
     OMP_NUM_THREADS=1 python studies/steps.py defaults             # what the data decide, a minute
     OMP_NUM_THREADS=1 python studies/steps.py sizes                # larger and smaller ones
     OMP_NUM_THREADS=1 python studies/steps.py sizes --before CHECKOUT --d3rlpy .venv-baselines/bin/python
-    OMP_NUM_THREADS=1 python studies/steps.py profile              # what the largest sizes spend their time on
+    OMP_NUM_THREADS=1 python studies/steps.py profile              # what defaults and the largest sizes spend their time on
 
 in turn with another version of this package, and with d3rlpy's Decision Transformer of the same width and depth, of which a
 step has 64 windows of 20 steps. Every measurement has a process of its own. Products are those that a step computes, of the
@@ -166,7 +166,7 @@ def profile(name: str) -> dict[str, float]:
     model = make_model(name)
     model.learn(1, log_interval=None)
     with th.profiler.profile(activities=[th.profiler.ProfilerActivity.CPU]) as profiled:
-        model.learn(4, log_interval=None)
+        model.learn(4 if name in SIZES else 50, log_interval=None)
     times = {each.key.removeprefix("aten::"): each.self_cpu_time_total for each in profiled.key_averages()}
     found = dict.fromkeys([*KINDS, "everything else"], 0.0)
     for operation, time_spent in times.items():
@@ -227,7 +227,7 @@ def main() -> None:
         print(json.dumps(measure(options.name, options.precision)))
         return
     if options.what == "profile":
-        for name in list(SIZES)[-2:]:
+        for name in (*DEFAULTS, *list(SIZES)[-2:]):
             print(f"{name}: " + ", ".join(f"{kind} {share:.0%}" for kind, share in profile(name).items()))
         return
     print(f"| | {' | '.join(COLUMNS.values())} |")
