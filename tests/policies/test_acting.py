@@ -11,6 +11,7 @@ from sb3_dtfm import DT, DTFM
 from sb3_dtfm.heads import FlowHead
 from sb3_dtfm.policies import DTFMPolicy
 from tests.conftest import TINY_FLOW_POLICY, TINY_POLICY, make_env
+from tests.timing import takes_less
 
 ALGORITHMS = [(DT, TINY_POLICY), (DTFM, TINY_FLOW_POLICY)]
 ONE_TOKEN_OPTIONS = {"tokens_per_step": 1, "film_return_to_go": True, "return_scaling": "timestep"}
@@ -201,6 +202,19 @@ def test_solver_can_be_changed_after_training(cheetah_buffer):
     assert np.allclose(fine, finest, atol=1e-3)
     with pytest.raises(ValueError, match="flow_solver must be one of"):
         model.policy.set_acting(flow_solver="leapfrog", flow_steps=3)
+
+
+def test_ten_thousand_rows_are_acted_on_in_two_seconds(cheetah_buffer):
+    """At the default size, which draws by the flow for demonstrations."""
+    acting = dict(flow_steps=10, chunk_size=8, return_conditioning=False, regression_coef=0.0)
+    model = DTFM("MultiInputPolicy", dataset=cheetah_buffer, policy_kwargs=acting, seed=0, device="cpu")
+    random = np.random.default_rng(0)
+    rows = {
+        "observation": random.normal(size=(10_000, *cheetah_buffer.observation_space.shape)).astype(np.float32),
+        "return_to_go": np.full((10_000, 1), 10.0, np.float32),
+        "timestep": np.zeros((10_000, 1), np.int64),
+    }
+    assert takes_less(2.0, lambda: model.predict(rows, episode_start=np.ones(10_000, bool)))
 
 
 def test_an_observation_without_return_to_go_is_refused(model):
