@@ -5,7 +5,7 @@ import io
 import re
 import subprocess
 import tokenize
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -62,11 +62,16 @@ def texts(source: str) -> Iterator[str]:
     yield from comments
 
 
-def misbegun(source: str) -> list[str]:
+def paragraphs(page: str) -> list[str]:
+    """Text of a page without code; an entry of a list and a cell of a table are texts of their own."""
+    return re.split(
+        r"\n\s*\n|^\s*(?:- |\d+\. |#+ )|\|", re.sub(r"```.*?```|\*\*", "", page, flags=re.DOTALL), flags=re.MULTILINE
+    )
+
+
+def misbegun(found: Iterable[str]) -> list[str]:
     """Sentences that begin like a question and are none."""
-    if not ASKS.search(source):
-        return []
-    sentences = (sentence.strip() for text in texts(source) for sentence in SENTENCES_END.split(text))
+    sentences = (sentence.strip() for text in found for sentence in SENTENCES_END.split(text))
     return [sentence for sentence in sentences if ASKS.match(sentence) and not sentence.endswith("?")]
 
 
@@ -87,9 +92,11 @@ def test_a_word_is_found():
 
 
 def test_sentences_begin_with_their_subject():
-    paths = [path for path in files() if path.suffix == ".py" and path.relative_to(ROOT).parts[0] in FOLDERS]
-    assert paths
-    assert [f"{path.relative_to(ROOT)}: {each}" for path in paths for each in misbegun(path.read_text())] == []
+    readers = {".py": texts, ".md": paragraphs}
+    paths = [path for path in files() if path.suffix in readers and path.relative_to(ROOT).parts[0] in (*FOLDERS, path.name)]
+    assert {path.suffix for path in paths} == readers.keys()
+    found = {path: misbegun(readers[path.suffix](path.read_text())) for path in paths}
+    assert {path.relative_to(ROOT): each for path, each in found.items() if each} == {}
 
 
 def test_a_sentence_is_found():
@@ -106,4 +113,10 @@ def f(x):
     y = "# What"  # Who knows
     return y
 '''
-    assert misbegun(source) == ["What\nit was is gone.", "Of numbers", "Who knows"]
+    assert misbegun(texts(source)) == ["What\nit was is gone.", "Of numbers", "Who knows"]
+    page = """# What is it?
+**Where it is.** Here. Of these:
+- What fits
+| a | Who |
+"""
+    assert misbegun(paragraphs(page)) == ["Where it is.", "Of these:", "What fits", "Who"]

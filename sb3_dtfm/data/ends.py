@@ -36,7 +36,7 @@ class Ends(NamedTuple):
 
 def read_ends(arrays: Arrays, n_steps: int, max_episode_steps: int | None) -> Ends:
     """
-    Where episodes end, and how.
+    Find where episodes end, and how.
 
     :param arrays: of the file
     :param n_steps: N
