@@ -22,7 +22,7 @@ SOURCES := sb3_dtfm envs zoo_configs tests studies examples docs
 
 help:
 	@echo "make install  pinned environment in $(VENV), for Python 3.10 to 3.13"
-	@echo "make demo     record, train and evaluate on robosuite's Lift: 5 minutes on 2 cores"
+	@echo "make demo     record, train and evaluate on robosuite's Lift: 4 minutes on 2 cores"
 	@echo "make test     the fast tests"
 	@echo "make test-all the slow tests too: kills, a million calls, several processes; half an hour on 2 cores"
 	@echo "make bench    DT and DTFM beside d3rlpy, training and acting: 15 minutes on 2 idle cores"
