@@ -309,7 +309,7 @@ class OnlineManager(FinetuningManager):
     """
     The DTFM itself learns further, as an :class:`~sb3_dtfm.finetuning.OnlineDTFM`. The result is a run of "dtfm".
 
-    The dataset is that of the DTFM's run. Own episodes are saved beside the model; a later run that starts from it loads them.
+    The dataset is that of the DTFM's run. Own episodes are saved beside the model, and loaded by a run that starts from it.
     """
 
     command = "finetune"
