@@ -81,7 +81,12 @@ def compared(folder: Path, suite: Path) -> tuple[Grouped, list[str], list[str]]:
     for group in (group for study in read_studies([suite]) for group in study.groups):
         for (task, _, algo), runs in group.runs.items():
             defaults.setdefault((task, algo), []).extend(runs)
-    found = {(name, algo): runs for (name, algo), runs in grouped.items() if algo in others}
+    tasks = {name: data.task for name, data in read_entries(STUDIES / "baselines.yml", Data).items()}
+    found: Grouped = {}
+    for (name, algo), runs in grouped.items():
+        same = [run for run in runs if run.key.task == tasks[name]]  # not of the task with another reward
+        if same and algo in others:
+            found[name, algo] = same
     for name, algo in itertools.product(datasets, ALGORITHMS):
         if runs := defaults.get((IN_SUITE.get(name, name), algo)):
             found[name, algo] = runs
@@ -96,7 +101,7 @@ def suite_table(folder: Path, suite: Path) -> Iterable[Sequence[str]]:
     for name in datasets:
         found = {algo: grouped[name, algo] for algo in algorithms if (name, algo) in grouped}
         others = [algo for algo in found if algo not in ALGORITHMS]
-        best = max(others, key=lambda algo: float(np.mean([run.value("final") for run in found[algo]])))
+        best = max(others, key=lambda algo: float(np.mean([run.value("final") for run in found[algo]])), default=None)
         cells = {algo: result(runs) for algo, runs in found.items()}
         cells |= {algo: cells[algo].partition(" [")[0] for algo in others if algo != best}
         yield name, *(cells.get(algo, NONE) for algo in algorithms)
