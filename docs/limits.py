@@ -29,6 +29,8 @@ TRAINING_PATH = (
     "heads/flow.py",
     "heads/regression.py",
 )
+# Parts of a study.
+STUDY = (r"^\*\*Question\.", r"^\*\*Setup\.", r"^\| ---", r"^!\[", "^## Finding", "^## Limits", r"\*\*Commands?\.")
 # The commit after which subjects follow CONTRIBUTING.
 SUBJECTS_SINCE = "3a8e903826f089cfad7d3867de6233aee4cf4262"
 # Words that begin no imperative.
@@ -96,7 +98,11 @@ def sizes() -> Iterator[Size]:
     yield Size("words of docs", sum(words(page.read_text()) for page in pages), 25_000)
     for page in pages:
         if page.parent.name == "studies":
-            yield Size(f"words of studies/{page.name}", words(page.read_text()), 700)
+            text = page.read_text()
+            yield Size(f"words of studies/{page.name}", words(text), 700)
+            yield Size(f"tables of studies/{page.name}", len(re.findall(r"^\| ---", text, re.MULTILINE)), 1)
+            missing = [part for part in STUDY if not re.search(part, text, re.MULTILINE)]
+            yield Size(f"parts that studies/{page.name} lacks {missing or ''}".rstrip(), len(missing), 0)
     yield Size("lines from recorded steps to the loss", sum(n_lines(f"sb3_dtfm/{path}") for path in TRAINING_PATH), 2000)
     yield Size("files from recorded steps to the loss", len(TRAINING_PATH), 10)
     constructor = n_arguments("sb3_dtfm/algorithms/offline.py", "OfflineAlgorithm")
