@@ -16,8 +16,8 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[1]
 # Written by a tool, or tables that a test compares with the results.
 GENERATED = ("licences.md", "report.md")
-# Files that turn recorded steps into a loss; tests/test_training_path.py watches that none is missing. Reading data, deciding
-# settings, the optimiser and logging come before and after.
+# Files that turn recorded steps into a loss; tests/test_training_path.py watches that none is missing. Reading data and
+# deciding settings come before, the optimiser and logging after.
 TRAINING_PATH = (
     "algorithms/offline.py",
     "data/drawing.py",

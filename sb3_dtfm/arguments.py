@@ -7,6 +7,7 @@ import itertools
 import math
 import numbers
 import re
+import unicodedata
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -104,7 +105,8 @@ class Listed(NamedTuple):
         return all(map(self.rule.accepts, itertools.chain.from_iterable(entries)))
 
     def __str__(self) -> str:
-        return f"a list of {self.length or 'any number of'} entries, each {self.rule}, or None"
+        lists = " or a list of such" if self.nested else ""
+        return f"a list of {self.length or 'any number of'} entries, each {self.rule}{lists}, or None"
 
 
 class Text:
@@ -112,10 +114,10 @@ class Text:
 
     def accepts(self, value: Any) -> bool:
         """Return whether a value is such a text, or None."""
-        return value is None or (isinstance(value, str) and value.isprintable())
+        return value is None or (isinstance(value, str) and not any(unicodedata.category(each)[0] == "C" for each in value))
 
     def __str__(self) -> str:
-        return "text, or None"
+        return "text without control characters, or None"
 
 
 BOOLEAN = Choice((True, False))

@@ -17,7 +17,9 @@ from typing import NamedTuple
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-NUMBER = r"-?\d[\d,]*(?:\.\d+)?"
+NUMBER = r"(?<![\d.,])-?\d[\d,]*(?:\.\d+)?"
+# Digits that are no value.
+REMARKS = re.compile(r"\(.*?\)|\bseeds? \d+(?:, \d+)*(?: and \d+)?")
 
 
 class Cell(NamedTuple):
@@ -32,7 +34,7 @@ class Cell(NamedTuple):
 
 def read_cell(text: str) -> Cell:
     """Numbers of a cell, such as `4, 5, 6`, `39 to 47` or `51 [30, 72]`."""
-    outside, _, inside = text.partition("[")
+    outside, _, inside = REMARKS.sub("", text).partition("[")
     numbers = [[float(each.replace(",", "")) for each in re.findall(rf"{NUMBER}(?=\D|$)", part)] for part in
                (re.sub(r"(\d), (?=-?\d)", r"\1; ", part) for part in (outside, inside))]  # fmt: skip
     return Cell(numbers[0], (numbers[1][0], numbers[1][1]) if inside else None)
@@ -53,7 +55,8 @@ def draw(page: Path, columns: list[str], label: str) -> Path:
     :return: the PNG
     """
     titles, *rows = read_table(page)
-    chosen = [next(i for i, title in enumerate(titles) if title.startswith(name)) for name in columns]
+    places = [[i for i, title in enumerate(titles) if title.startswith(name)] for name in columns]
+    chosen = [min(found, key=lambda i: len(titles[i])) for found in places]
     rows = [cells for cells in rows if any(read_cell(cells[column]).values for column in chosen)]
     figure = Figure(figsize=(8.0, 0.32 * len(rows) + 1.2), layout="constrained")
     FigureCanvasAgg(figure)

@@ -64,9 +64,8 @@ def texts(source: str) -> Iterator[str]:
 
 def paragraphs(page: str) -> list[str]:
     """Text of a page without code; an entry of a list and a cell of a table are texts of their own."""
-    return re.split(
-        r"\n\s*\n|^\s*(?:- |\d+\. |#+ )|\|", re.sub(r"```.*?```|\*\*", "", page, flags=re.DOTALL), flags=re.MULTILINE
-    )
+    plain = re.sub(r"(```|~~~).*?\1|`[^`\n]*`|[*_>\[]", "", page, flags=re.DOTALL)
+    return re.split(r"\n\s*\n|^\s*(?:- |\d+\. |#+ )|\|", plain, flags=re.MULTILINE)
 
 
 def misbegun(found: Iterable[str]) -> list[str]:

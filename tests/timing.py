@@ -7,20 +7,17 @@ from collections.abc import Callable
 
 def takes_less(seconds: float, call: Callable[[], object], attempts: int = 3) -> bool:
     """
-    Whether at least one call takes less of the processor's time: neighbours on its caches, waiting threads and the
-    garbage of earlier tests only add to it.
+    Whether at least one call takes less of the process's time: neighbours on the processor's caches only add to it.
 
-    :param call: to be timed, once if it is fast enough
+    :param call: to be timed, once if it is fast enough; what tests before it have left is no garbage of its own
     """
-    collecting = gc.isenabled()
-    gc.disable()
+    gc.freeze()
     try:
         for _ in range(attempts):
-            start = time.thread_time()
+            start = time.process_time()
             call()
-            if time.thread_time() - start < seconds:
+            if time.process_time() - start < seconds:
                 return True
         return False
     finally:
-        if collecting:
-            gc.enable()
+        gc.unfreeze()

@@ -12,8 +12,8 @@ from minari.serialization import deserialize_space
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_dtfm.algorithms.saved_options import check_dataset_kwargs, check_text
 from sb3_dtfm.algorithms.saving import (
-    DATASET_OPTIONS,
     ENCODED,
     EXTRACTOR_KWARGS,
     OPTIMIZER,
@@ -24,9 +24,8 @@ from sb3_dtfm.algorithms.saving import (
     head_name,
     optimizers,
 )
-from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, Choice, Listed, Number, Rule, Text, check_arguments
+from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, Choice, Number, Rule, Text, check_arguments
 from sb3_dtfm.data import ReturnReference, check_action_space
-from sb3_dtfm.data.readers import check_options
 from sb3_dtfm.envs import OBSERVATION, RETURN_TO_GO, TIMESTEP, image_spaces
 from sb3_dtfm.files import ModelFileError, file_name, read_model
 from sb3_dtfm.optimization import RunningMeans
@@ -57,15 +56,6 @@ SAVED: dict[str, Rule] = {
 }
 # Attributes of several values, each with a check of its own.
 STRUCTURED = {"policy_kwargs", "dataset_kwargs", "score_reference", "return_reference", "controller", "online_actor"}
-# Options of single readers.
-READER_OPTIONS: dict[str, Rule] = {
-    "env_id": Text(),
-    "filter_key": Text(),
-    "on_invalid": Choice(("raise", "drop")),
-    "episodes": Listed(WHOLE),
-    "image_size": Listed(COUNT, 2),
-    "action_bounds": Listed(Number(), 2, nested=True),
-}
 # Values of a ReturnReference, in its order.
 RETURN_REFERENCE: tuple[Rule, ...] = (
     *(Number(), Number(), Number(), COUNT, BOOLEAN),
@@ -160,6 +150,10 @@ def read_saved(
     attributes["learning_rate"] = _to_learning_rate(taken("learning_rate", (int, float, str, dict)), source)
     if "policy_class" not in custom_objects:
         attributes["policy_class"] = _policy_class(policies, taken("policy_class", str), source)
+    with wrap_file_errors(source):
+        check_dataset_kwargs(attributes.get("dataset_kwargs"))
+        for name in ("policy_kwargs", "controller", "online_actor"):
+            check_text(attributes.get(name), name)
     attributes.update({name: each for name, each in custom_objects.items() if name in {*attributes, *ENCODED}})
     _check_attributes(attributes, source)
     return SavedModel(attributes, tensors, source)
@@ -181,7 +175,6 @@ def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
     extractor = attributes.get("policy_kwargs", {}).get(EXTRACTOR_KWARGS)
     if isinstance(extractor, dict) and WEIGHTS in extractor:
         raise ModelFileError(f"{source}: {EXTRACTOR_KWARGS} name a file of {WEIGHTS}, which no saved model needs.")
-    _check_dataset_kwargs(attributes.get("dataset_kwargs"), f"{source}: dataset_kwargs")
     reference: Any = attributes.get("score_reference")
     kinds = [type(each) for each in reference] if isinstance(reference, list) else reference
     told = kinds == [float, float, str] and reference[0] < reference[1] and Text().accepts(reference[2])
@@ -206,19 +199,6 @@ def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
         raise ModelFileError(f"{source}: observation_space is {observation}, not what a ReturnToGoWrapper observes.")
     with wrap_file_errors(source):
         check_action_space(action, "action_space")
-
-
-def _check_dataset_kwargs(given: Any, where: str) -> None:
-    """Check options of `load_dataset`, whose own checks come when data are read."""
-    if given is None:
-        return
-    if not isinstance(given, dict):
-        raise ModelFileError(f"{where} are {given!r:.40}, expected arguments by name, or None.")
-    for name in given.keys() - set(DATASET_OPTIONS):
-        raise ModelFileError(f"{where}: {name!r:.40} is no option in a file; accepted: {', '.join(DATASET_OPTIONS)}.")
-    with wrap_file_errors(where):
-        check_options(given)
-        check_arguments(given, {name: rule for name, rule in READER_OPTIONS.items() if name in given})
 
 
 def _space(described: str, what: str) -> spaces.Space:

@@ -404,9 +404,9 @@ class SequenceModel(BaseAlgorithm):
 
         :param path: file to write
         :param exclude: attributes to leave out beside the default ones
-        :param include: attributes to save although they are left out by default
+        :param include: attributes to save whatever `exclude` names; an error, not a warning, tells of one that cannot be
         :raises OSError: names the path, where what was there before still is
-        :raises ValueError: an attribute of `include` that is no plain value, or of which a model knows nothing
+        :raises ValueError: an attribute of `include` that no file holds, such as an environment or the data
         """
         if not is_first_process():
             return

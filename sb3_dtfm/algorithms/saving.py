@@ -13,6 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
+from sb3_dtfm.algorithms.saved_options import DATASET_OPTIONS, check_dataset_kwargs
 from sb3_dtfm.files import printable
 from sb3_dtfm.optimization import RunningMeans
 from sb3_dtfm.policies import SequencePolicy
@@ -25,11 +26,6 @@ SPACES = ("observation_space", "action_space")
 ENCODED = {*SPACES, "policy_class", "learning_rate", "_means"}
 
 
-# Options of `dataset_kwargs` that a file may hold; the loading user says where a cache lies and whether a pickle may run.
-DATASET_OPTIONS = (
-    *("env_id", "max_episode_steps", "min_return", "best_share", "success_only", "fraction", "fraction_seed", "on_invalid"),
-    *("observation_keys", "action_keys", "action_bounds", "clip_actions", "filter_key", "episodes", "image_size"),
-)
 # `weights` among `features_extractor_kwargs` is a file that only the first training needs.
 EXTRACTOR, EXTRACTOR_KWARGS, WEIGHTS = "features_extractor_class", "features_extractor_kwargs", "weights"
 
@@ -69,20 +65,24 @@ def to_configuration(
     :param wanted: attributes that the caller asked for by name
     :raises ValueError: one that is wanted cannot be saved
     """
+    for name in set(wanted) - vars(model).keys():
+        raise ValueError(f"{name} is no part of a saved model: this one has no such attribute.")
     attributes = {name: value for name, value in vars(model).items() if name not in {*left_out, *ENCODED}}
     if attributes.get("dataset_kwargs"):
-        kept = {name: value for name, value in attributes["dataset_kwargs"].items() if name in DATASET_OPTIONS}
-        attributes["dataset_kwargs"] = kept
+        attributes["dataset_kwargs"] = _saved_dataset_kwargs(attributes["dataset_kwargs"])
     if "policy_kwargs" in attributes:
         attributes["policy_kwargs"] = _without_weights(attributes["policy_kwargs"])
     saved: dict[str, Any] = {}
     for name, value in attributes.items():
         try:
             if name not in known:
-                raise ValueError("no model has such an attribute; of a subclass its constructor's arguments are saved")
+                raise ValueError("files hold attributes of all models, and of a subclass its constructor's arguments")
             saved[name] = _json(value)
+            if name == "dataset_kwargs":
+                check_dataset_kwargs(saved[name])
         except (TypeError, ValueError) as error:
-            problem = f"{name} is no part of a saved model: {error}."
+            saved.pop(name, None)
+            problem = f"{name} is no part of a saved model: {error}"
             if name in wanted:
                 raise ValueError(problem) from error
             warnings.warn(problem, stacklevel=3)
@@ -94,6 +94,16 @@ def to_configuration(
         **{name: serialize_space(getattr(model, name)) for name in SPACES},
         "attributes": saved,
     }
+
+
+def _saved_dataset_kwargs(dataset_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Those that a file may hold; the others are named, but for a cache's folder, which is of this machine."""
+    kept = {name: value for name, value in dataset_kwargs.items() if name in DATASET_OPTIONS}
+    if unsaved := sorted(dataset_kwargs.keys() - kept.keys() - {"cache_dir"}):
+        warnings.warn(
+            f"dataset_kwargs: {', '.join(unsaved)}: not saved; give dataset_kwargs again to learn further.", stacklevel=4
+        )
+    return kept
 
 
 def saved_policy_kwargs(policy_kwargs: Any) -> Any:
@@ -129,10 +139,10 @@ def _json(value: Any) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """NumPy's numbers, as Python's."""
-    if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(f"it is a {type(value).__name__}, not plain values")
+    """NumPy's numbers and arrays, as Python's."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"it holds a {type(value).__name__}, not plain values")
 
 
 def head_name(policies: Mapping[str, type[BasePolicy]]) -> str:

@@ -14,7 +14,8 @@ from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_dtfm.algorithms import DTFM
-from sb3_dtfm.arguments import COUNT, POSITIVE, Rule, check_arguments, whole_timesteps
+from sb3_dtfm.algorithms.loading import SAVED
+from sb3_dtfm.arguments import POSITIVE, Rule, check_arguments, whole_timesteps
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer, load_dataset
 from sb3_dtfm.data.buffer import with_npz
 from sb3_dtfm.distributed import DataParallel, n_processes
@@ -28,8 +29,8 @@ from sb3_dtfm.windows import Windows
 SelfOnlineDTFM = TypeVar("SelfOnlineDTFM", bound="OnlineDTFM")
 
 ACCEPTED: dict[str, Rule] = {
-    "n_episodes": COUNT,
-    "gradient_steps": COUNT,
+    "n_episodes": SAVED["n_episodes"],
+    "gradient_steps": SAVED["gradient_steps"],
 }
 
 

@@ -31,7 +31,9 @@ def read(folder: Path) -> tuple[Grouped, list[str], list[str]]:
     known = [*ALGORITHMS, *read_entries(HERE / "settings.yml", Baseline)]
     grouped: Grouped = {}
     for group in (group for study in read_studies([folder]) for group in study.groups):
-        name = max((each for each in datasets if f"{group.label}-".startswith(f"{each}-")), key=len)
+        name = max((each for each in datasets if f"{group.label}-".startswith(f"{each}-")), key=len, default=None)
+        if name is None:
+            raise ValueError(f"{folder}: label {group.label!r} begins with no data set of studies/baselines.yml.")
         changed = group.label[len(name) + 1 :]
         for (_, _, algo), runs in group.runs.items():
             grouped.setdefault((name, ", ".join(filter(None, (algo, changed)))), []).extend(runs)

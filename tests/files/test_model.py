@@ -153,8 +153,8 @@ def test_what_cannot_be_saved_is_left_out_aloud_or_refused_if_asked_for(cheetah_
     with pytest.warns(UserWarning, match="is no part of a saved model") as warned:
         model.save(tmp_path / "model")
     about = sorted(str(each.message) for each in warned)
-    assert "controller is no part of a saved model: it is a function, not plain values" in about[0]
-    assert "note is no part of a saved model: no model has such an attribute" in about[1]
+    assert "controller is no part of a saved model: it holds a function, not plain values" in about[0]
+    assert "note is no part of a saved model: files hold attributes of all models" in about[1]
     for name in ("buffer", "note", "controller"):
         with pytest.raises(ValueError, match=f"{name} is no part of a saved model"):
             model.save(tmp_path / "other", include=[name], exclude={"note", "controller"} - {name})
@@ -194,15 +194,31 @@ def test_arguments_of_a_subclass_come_back_to_it_alone(cheetah_buffer, tmp_path)
     assert FinetunedDTFM.of(model).policy.action_space == model.action_space
 
 
-@pytest.mark.parametrize("name", ["tensorboard_log", "env", "dataset", "predict", "buffer"])
+@pytest.mark.parametrize("name", ["tensorboard_log", "env", "dataset", "buffer", "lr_schedule", "not_there"])
 def test_what_could_not_be_loaded_is_not_saved(name, cheetah_buffer, tmp_path):
     model = make_model(DT, cheetah_buffer, env=make_env(), tensorboard_log=str(tmp_path))
     model.dataset = "somewhere.npz"
-    if not hasattr(model, name) or name == "predict":
-        model.predict = 1
     with pytest.raises(ValueError, match=f"{name} is no part of a saved model"):
         model.save(tmp_path / "model", include=[name])
     assert not (tmp_path / "model.zip").exists()
+
+
+def test_options_of_the_data_are_saved_or_named(cheetah_buffer, tmp_path):
+    model = make_model(DT, cheetah_buffer)
+    model.dataset_kwargs = {
+        "action_bounds": (np.array([-1.0, -1.0]), 1.0), "env_id": "My\u00a0Env-v0", "observation_keys": ("a", "b"),
+        "observation_space": model.observation_space, "env_args": {}, "cache_dir": "here",
+    }  # fmt: skip
+    with pytest.warns(UserWarning, match="dataset_kwargs: env_args, observation_space: not saved; give"):
+        model.save(tmp_path / "model")
+    expected = {"action_bounds": [[-1.0, -1.0], 1.0], "env_id": "My\u00a0Env-v0", "observation_keys": ["a", "b"]}
+    assert DT.load(tmp_path / "model").dataset_kwargs == expected
+    mine = {"observation_space": model.observation_space}
+    assert DT.load(tmp_path / "model", custom_objects={"dataset_kwargs": mine}).dataset_kwargs == mine
+    model.dataset_kwargs = {"action_bounds": ("-1", "1")}
+    with pytest.warns(UserWarning, match="dataset_kwargs is no part of a saved model: dataset_kwargs: action_bounds must"):
+        model.save(tmp_path / "model")
+    assert getattr(DT.load(tmp_path / "model"), "dataset_kwargs", None) is None
 
 
 def test_a_policy_of_ones_own_is_asked_for(cheetah_buffer, tmp_path):
@@ -339,13 +355,15 @@ BAD_CONFIGURATIONS = [
     (("attributes", "dataset_kwargs"), {"action_space": 5}, "'action_space' is no option in a file"),
     (("attributes", "dataset_kwargs"), {"env_args": {"a": 1}}, "'env_args' is no option in a file"),
     (("attributes", "dataset_kwargs"), {"\x1b[2J": 1}, r"'\x1b[2J' is no option in a file"),
-    (("attributes", "dataset_kwargs"), {"filter_key": 5}, "filter_key must be text, or None"),
-    (("attributes", "dataset_kwargs"), {"env_id": "\x1b[2J"}, "env_id must be text, or None"),
+    (("attributes", "dataset_kwargs"), {"filter_key": 5}, "filter_key must be text without control characters, or None"),
+    (("attributes", "dataset_kwargs"), {"env_id": "\x1b[2J"}, "env_id must be text without control characters, or None"),
     (("attributes", "dataset_kwargs"), {"on_invalid": "x"}, "on_invalid must be one of raise, drop"),
     (("attributes", "dataset_kwargs"), {"episodes": [-1]}, "episodes must be a list of any number of entries, each a whole"),
     (("attributes", "dataset_kwargs"), {"image_size": [84]}, "image_size must be a list of 2 entries"),
     (("attributes", "dataset_kwargs"), {"action_bounds": "x"}, "action_bounds must be a list of 2 entries"),
     (("attributes", "dataset_kwargs"), [], "dataset_kwargs are []"),
+    (("attributes", "dataset_kwargs"), {"observation_keys": ["\x1b[2J"]}, "dataset_kwargs holds '\\x1b[2J'; text without"),
+    (("attributes", "controller"), {"\x1b[2J": 1}, "controller holds '\\x1b[2J'; text without"),
     (("attributes", "score_reference"), [0.0, 1.0, "\x1b[2J"], "expected two returns and where they come from"),
     (("attributes", "n_episodes"), 10**30, "n_episodes must be"),
     (("attributes", "online_actor"), 5, "online_actor is 5, expected its settings, or None"),

@@ -201,6 +201,7 @@ def test_the_table_has_a_line_for_each_dataset_and_algorithm_and_tells_the_best(
     made += [("walker2d-mediocre-noisy", "bc", 0, 5.0), ("walker2d-mediocre-noisy", "dtfm", 0, 4.0)]
     for number, (label, algo, seed, each) in enumerate(made):
         changed = {"label": label, "algo": algo, "seed": seed, "returns": [each] * 3, "action_ms": 0.5}
+        changed["task"] = "AdroitHandDoorPublished-v1" if label.startswith("door-mixed") else "Walker2d-v5"
         write_row(tmp_path / "made" / f"{number}.jsonl", {**row, **changed})
     header, *lines = table.long_table(tmp_path / "made")
     assert header[:5] == ("data", "algorithm", "seeds", "final", "each seed")
@@ -215,9 +216,17 @@ def test_the_table_has_a_line_for_each_dataset_and_algorithm_and_tells_the_best(
     for seed, each in enumerate((40.0, 60.0)):
         ours = {"task": "door-mixed", "algo": "dtfm", "label": "", "profile": "default", "seed": seed, "returns": [each] * 3}
         write_row(tmp_path / "suite" / f"{seed}.jsonl", {**row, **ours})
+    other_reward = {
+        "label": "door-mixed",
+        "algo": "iql",
+        "task": "AdroitHandDoor-v1",
+        "returns": [9000.0] * 3,
+        "action_ms": 0.5,
+    }
+    write_row(tmp_path / "made" / "other.jsonl", {**row, **other_reward})
     assert list(table.suite_table(tmp_path / "made", tmp_path / "suite")) == [
-        ("data", "DT", "DTFM", "bc", "bc, longer"),
-        ("door-mixed", "-", "50 [-77, 177]", "20", "2,000 (1 seed)"),  # the best of the others has its interval
+        ("data", "DT", "DTFM", "bc", "bc, longer", "iql"),
+        ("door-mixed", "-", "50 [-77, 177]", "20", "2,000 (1 seed)", "-"),  # the best of the others has its interval
     ]
 
 

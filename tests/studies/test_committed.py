@@ -52,7 +52,7 @@ def number(cell: str) -> float:
 
 def others(data_set: str) -> dict[str, str]:
     """Results of the other libraries, by algorithm."""
-    grouped, _, _ = table.read(ROOT / "results" / "baselines.csv")
+    grouped, _, _ = table.compared(ROOT / "results" / "baselines.csv", ROOT / "results" / "suite.csv")
     found = {algo: table.result(runs) for (name, algo), runs in grouped.items() if name == data_set and algo in BASELINES}
     return {algo: re.sub(r"^(\S+) %(.*)$", r"\1\2 %", cell) for algo, cell in found.items()}
 
