@@ -163,7 +163,8 @@ def test_a_class_of_a_users_own_is_given_as_sb3_takes_it_and_comes_back_by_its_n
         DT.load(tmp_path / "model")
     kwargs["features_extractor_kwargs"] = dict(activation=th.nn.Tanh)
     with pytest.raises(
-        ValueError, match="features_extractor_kwargs: it holds a type, not plain values; a model's file holds numbers, text, lists and"
+        ValueError,
+        match="features_extractor_kwargs: it holds a type, not plain values; a model's file holds numbers, text, lists and",
     ):
         make_model(DT, buffer, policy_kwargs=kwargs)
     EXTRACTORS.pop("Means", None)
