@@ -17,7 +17,6 @@ ROOT = Path(__file__).parents[2]
 IN_README = {
     "Hopper, one agent *": "hopper*",
     "HalfCheetah, five agents *": "halfcheetah-mixed-quality*",
-    "Walker2d, five agents": "walker2d-mixed-quality",
     "Walker2d, three noisy agents *": "walker2d-mediocre-noisy*",
     "Swimmer, one agent": "swimmer",
     "Robosuite Stack, 50 scripted demonstrations": "stack-50",
