@@ -5,15 +5,15 @@ import time
 from collections.abc import Callable
 
 
-def takes_less(seconds: float, call: Callable[[], object], attempts: int = 3) -> bool:
+def takes_less(seconds: float, call: Callable[[], object]) -> bool:
     """
-    Whether at least one call takes less of the process's time: neighbours on the processor's caches only add to it.
+    Whether one of three calls takes less of the process's time: neighbours on the processor's caches only add to it.
 
     :param call: to be timed, once if it is fast enough; what tests before it have left is no garbage of its own
     """
     gc.freeze()
     try:
-        for _ in range(attempts):
+        for _ in range(3):
             start = time.process_time()
             call()
             if time.process_time() - start < seconds:

@@ -12,7 +12,7 @@ from minari.serialization import deserialize_space
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_dtfm.algorithms.saved_options import check_dataset_kwargs, check_text
+from sb3_dtfm.algorithms.saved_options import STRUCTURED, check_dataset_kwargs, check_text
 from sb3_dtfm.algorithms.saving import (
     ENCODED,
     EXTRACTOR_KWARGS,
@@ -24,7 +24,7 @@ from sb3_dtfm.algorithms.saving import (
     head_name,
     optimizers,
 )
-from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, Choice, Number, Rule, Text, check_arguments
+from sb3_dtfm.arguments import BOOLEAN, COUNT, NOT_NEGATIVE, Choice, Number, Rule, check_arguments
 from sb3_dtfm.data import ReturnReference, check_action_space
 from sb3_dtfm.envs import OBSERVATION, RETURN_TO_GO, TIMESTEP, image_spaces
 from sb3_dtfm.files import ModelFileError, file_name, read_model
@@ -54,8 +54,6 @@ SAVED: dict[str, Rule] = {
     "_current_learning_rate": NOT_NEGATIVE,
     "_training_seed": Number(low=0, high=2**64, below_high=True, whole=True, optional=True),
 }
-# Attributes of several values, each with a check of its own.
-STRUCTURED = {"policy_kwargs", "dataset_kwargs", "score_reference", "return_reference", "controller", "online_actor"}
 # Values of a ReturnReference, in its order.
 RETURN_REFERENCE: tuple[Rule, ...] = (
     *(Number(), Number(), Number(), COUNT, BOOLEAN),
@@ -152,7 +150,7 @@ def read_saved(
         attributes["policy_class"] = _policy_class(policies, taken("policy_class", str), source)
     with wrap_file_errors(source):
         check_dataset_kwargs(attributes.get("dataset_kwargs"))
-        for name in ("policy_kwargs", "controller", "online_actor"):
+        for name in STRUCTURED:
             check_text(attributes.get(name), name)
     attributes.update({name: each for name, each in custom_objects.items() if name in {*attributes, *ENCODED}})
     _check_attributes(attributes, source)
@@ -177,8 +175,7 @@ def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
         raise ModelFileError(f"{source}: {EXTRACTOR_KWARGS} name a file of {WEIGHTS}, which no saved model needs.")
     reference: Any = attributes.get("score_reference")
     kinds = [type(each) for each in reference] if isinstance(reference, list) else reference
-    told = kinds == [float, float, str] and reference[0] < reference[1] and Text().accepts(reference[2])
-    if reference is not None and not told:
+    if kinds not in (None, [float, float, str]) or (reference and not reference[0] < reference[1]):
         raise ModelFileError(f"{source}: score_reference is {reference}, expected two returns and where they come from.")
     returns: Any = attributes.get("return_reference")
     known = isinstance(returns, list) and len(returns) == len(RETURN_REFERENCE)

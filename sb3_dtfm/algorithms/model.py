@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
-from types import FunctionType
 from typing import Any, TypeVar
 
 import gymnasium as gym
@@ -21,8 +20,9 @@ from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dtfm.actions import ActionSpace, same_actions
-from sb3_dtfm.algorithms.loading import SAVED, STRUCTURED, SavedModel, check_policy, parameters, read_saved, wrap_file_errors
+from sb3_dtfm.algorithms.loading import SAVED, SavedModel, check_policy, parameters, read_saved, wrap_file_errors
 from sb3_dtfm.algorithms.options import TrainingOptions
+from sb3_dtfm.algorithms.saved_options import STRUCTURED
 from sb3_dtfm.algorithms.saving import (
     ENCODED,
     OPTIMIZER,
@@ -449,9 +449,7 @@ class SequenceModel(BaseAlgorithm):
         classes = (each for each in type(self).__mro__ if issubclass(each, SequenceModel) and each is not SequenceModel)
         given = itertools.chain.from_iterable(inspect.signature(each).parameters.values() for each in classes)
         arguments = {each.name for each in given if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)}
-        own = {name: inspect.getattr_static(self, name, None) for name in arguments}
-        methods = {name for name, value in own.items() if isinstance(value, property | FunctionType)}
-        return (KNOWN | arguments) - {"_init_setup_model", *methods, *self._excluded_save_params()}
+        return (KNOWN | arguments) - {"_init_setup_model", *self._excluded_save_params()}
 
     def _excluded_save_params(self) -> list[str]:
         of_an_environment = [

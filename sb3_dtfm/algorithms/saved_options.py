@@ -1,4 +1,4 @@
-"""Options of the data that a model's file holds, each with its rule."""
+"""Attributes of several values that a model's file holds, and what saving and loading accept of them alike."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 from sb3_dtfm.arguments import COUNT, Choice, Listed, Number, Rule, Text, check_arguments
 from sb3_dtfm.data.readers import check_options
 
+STRUCTURED = ("policy_kwargs", "dataset_kwargs", "score_reference", "return_reference", "controller", "online_actor")
 # Options of `dataset_kwargs` that a file may hold; the loading user says where a cache lies and whether a pickle may run.
 DATASET_OPTIONS = (
     *("env_id", "max_episode_steps", "min_return", "best_share", "success_only", "fraction", "fraction_seed", "on_invalid"),
@@ -33,14 +34,13 @@ def check_dataset_kwargs(given: Any) -> None:
         return
     if not isinstance(given, dict):
         raise ValueError(f"dataset_kwargs are {given!r:.40}, expected arguments by name, or None.")
-    for name in given.keys() - set(DATASET_OPTIONS):
+    for name in sorted(given.keys() - set(DATASET_OPTIONS)):
         raise ValueError(f"dataset_kwargs: {name!r:.40} is no option in a file; accepted: {', '.join(DATASET_OPTIONS)}.")
     try:
         check_options(given)
         check_arguments(given, {name: rule for name, rule in READER_OPTIONS.items() if name in given})
     except ValueError as error:
         raise ValueError(f"dataset_kwargs: {error}") from error
-    check_text(given, "dataset_kwargs")
 
 
 def check_text(value: Any, name: str) -> None:

@@ -13,7 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
-from sb3_dtfm.algorithms.saved_options import DATASET_OPTIONS, check_dataset_kwargs
+from sb3_dtfm.algorithms.saved_options import DATASET_OPTIONS, STRUCTURED, check_dataset_kwargs, check_text
 from sb3_dtfm.files import printable
 from sb3_dtfm.optimization import RunningMeans
 from sb3_dtfm.policies import SequencePolicy
@@ -65,7 +65,7 @@ def to_configuration(
     :param wanted: attributes that the caller asked for by name
     :raises ValueError: one that is wanted cannot be saved
     """
-    for name in set(wanted) - vars(model).keys():
+    for name in sorted(set(wanted) - vars(model).keys()):
         raise ValueError(f"{name} is no part of a saved model: this one has no such attribute.")
     attributes = {name: value for name, value in vars(model).items() if name not in {*left_out, *ENCODED}}
     if attributes.get("dataset_kwargs"):
@@ -76,12 +76,14 @@ def to_configuration(
     for name, value in attributes.items():
         try:
             if name not in known:
-                raise ValueError("files hold attributes of all models, and of a subclass its constructor's arguments")
-            saved[name] = _json(value)
+                raise ValueError("files hold a model's settings and progress, and a subclass's constructor arguments")
+            plain = _json(value)
             if name == "dataset_kwargs":
-                check_dataset_kwargs(saved[name])
+                check_dataset_kwargs(plain)
+            if name in STRUCTURED:
+                check_text(plain, name)
+            saved[name] = plain
         except (TypeError, ValueError) as error:
-            saved.pop(name, None)
             problem = f"{name} is no part of a saved model: {error}"
             if name in wanted:
                 raise ValueError(problem) from error
@@ -111,14 +113,14 @@ def saved_policy_kwargs(policy_kwargs: Any) -> Any:
     Arguments of the policy that a file can hold: of a class for images its name, by which it is entered among the known.
 
     :param policy_kwargs: as they were given
-    :raises ValueError: those of such a class are no plain values, without which no file could be loaded
+    :raises ValueError: those of such a class are no plain values, or no plain text, without which no file could be loaded
     """
     if not isinstance(policy_kwargs, dict):
         return policy_kwargs
     if EXTRACTOR in policy_kwargs:
         policy_kwargs = {**policy_kwargs, EXTRACTOR: extractor_name(policy_kwargs[EXTRACTOR])}
     try:
-        _json(_without_weights(policy_kwargs).get(EXTRACTOR_KWARGS))
+        check_text(_json(_without_weights(policy_kwargs).get(EXTRACTOR_KWARGS)), "it")
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"{EXTRACTOR_KWARGS}: {error}; a model's file holds numbers, text, lists and dictionaries."

@@ -438,14 +438,6 @@ def enjoy_arguments(argv: Sequence[str]) -> tuple[float | None, list[str]]:
         raise UsageError(f"--target-return: for --algo {' and '.join(ALGORITHMS)} only, not for {options.algo}.")
     folder = options.folder or ("logs" if ours else None)
     with_target_return(options.target_return, None)  # refuses what is none
-    env, device = ([f"--{name}", vars(options)[name]] if vars(options)[name] else [] for name in ("env", "device"))
-    arguments = [
-        "--algo",
-        options.algo,
-        *env,
-        *rest,
-        *device,
-        *_packages(options),
-        *(["--folder", folder] if folder else []),
-    ]
-    return options.target_return, arguments
+    given = {"--env": options.env, "--device": options.device, "--folder": folder}
+    known = [word for option, value in given.items() if value for word in (option, value)]
+    return options.target_return, ["--algo", options.algo, *rest, *known, *_packages(options)]

@@ -19,9 +19,10 @@ from stable_baselines3.common.save_util import save_to_zip_file
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_dtfm import DT, DTFM
-from sb3_dtfm.algorithms.loading import SAVED, STRUCTURED
+from sb3_dtfm.algorithms.loading import SAVED
 from sb3_dtfm.algorithms.model import ACCEPTED
 from sb3_dtfm.algorithms.options import TrainingOptions
+from sb3_dtfm.algorithms.saved_options import STRUCTURED
 from sb3_dtfm.files import ModelFileError
 from sb3_dtfm.finetuning import FinetunedDTFM
 from tests.algorithms.small import make_model
@@ -154,7 +155,7 @@ def test_what_cannot_be_saved_is_left_out_aloud_or_refused_if_asked_for(cheetah_
         model.save(tmp_path / "model")
     about = sorted(str(each.message) for each in warned)
     assert "controller is no part of a saved model: it holds a function, not plain values" in about[0]
-    assert "note is no part of a saved model: files hold attributes of all models" in about[1]
+    assert "note is no part of a saved model: files hold a model's settings" in about[1]
     for name in ("buffer", "note", "controller"):
         with pytest.raises(ValueError, match=f"{name} is no part of a saved model"):
             model.save(tmp_path / "other", include=[name], exclude={"note", "controller"} - {name})
@@ -215,6 +216,11 @@ def test_options_of_the_data_are_saved_or_named(cheetah_buffer, tmp_path):
     assert DT.load(tmp_path / "model").dataset_kwargs == expected
     mine = {"observation_space": model.observation_space}
     assert DT.load(tmp_path / "model", custom_objects={"dataset_kwargs": mine}).dataset_kwargs == mine
+    model.controller = {"robot": "two\nlines"}
+    with pytest.warns(UserWarning, match="controller is no part of a saved model: controller holds .*text without control"):
+        model.save(tmp_path / "model", exclude=["dataset_kwargs"])
+    assert DT.load(tmp_path / "model").controller is None
+    model.controller = None
     model.dataset_kwargs = {"action_bounds": ("-1", "1")}
     with pytest.warns(UserWarning, match="dataset_kwargs is no part of a saved model: dataset_kwargs: action_bounds must"):
         model.save(tmp_path / "model")
@@ -364,7 +370,7 @@ BAD_CONFIGURATIONS = [
     (("attributes", "dataset_kwargs"), [], "dataset_kwargs are []"),
     (("attributes", "dataset_kwargs"), {"observation_keys": ["\x1b[2J"]}, "dataset_kwargs holds '\\x1b[2J'; text without"),
     (("attributes", "controller"), {"\x1b[2J": 1}, "controller holds '\\x1b[2J'; text without"),
-    (("attributes", "score_reference"), [0.0, 1.0, "\x1b[2J"], "expected two returns and where they come from"),
+    (("attributes", "score_reference"), [0.0, 1.0, "\x1b[2J"], "score_reference holds '\\x1b[2J'; text without"),
     (("attributes", "n_episodes"), 10**30, "n_episodes must be"),
     (("attributes", "online_actor"), 5, "online_actor is 5, expected its settings, or None"),
     (("attributes", "dataset_kwargs"), "x", "dataset_kwargs are 'x'"),

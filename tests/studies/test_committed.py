@@ -4,11 +4,13 @@ import re
 from collections import defaultdict
 from pathlib import Path
 
+import numpy as np
 from baselines import table
 
 from sb3_dtfm.benchmark import grid
 from sb3_dtfm.benchmark.grid import read_tasks
 from sb3_dtfm.benchmark.report.runs import read_studies
+from sb3_dtfm.benchmark.report.statistics import student_t
 from sb3_dtfm.benchmark.report.tables import make_report
 from sb3_dtfm.cli.benchmark import parse_arguments
 
@@ -65,3 +67,20 @@ def test_readme_says_what_the_rows_say_and_names_the_best_baseline():
         cells = [("bc", bc), ("bc-best", bc_best), *others(data_set.rstrip("*")).items()]
         best, result = max(cells, key=lambda cell: number(cell[1]))
         assert f"| {name} | {recorded} | {BASELINES[best]} {result} | {dt} | {dtfm} |" in readme
+
+
+def test_readme_says_what_the_rows_of_ogbench_say():
+    solved: dict[tuple[str, int], list[float]] = defaultdict(list)
+    for study in read_studies([ROOT / "results" / "ogbench.csv"]):
+        for group in study.groups:
+            for (task, _, algo), runs in group.runs.items():
+                for run in runs if task.startswith("cube-single") else ():
+                    solved[algo, run.key.seed].append(run.value("final"))
+    assert {len(tasks) for (algo, _), tasks in solved.items() if algo in ("dt", "dtfm")} == {5}
+    by_seed = [float(np.mean(tasks)) for (algo, _), tasks in solved.items() if algo == "dtfm"]
+    (plain,) = (float(np.mean(tasks)) for (algo, _), tasks in solved.items() if algo == "dt")
+    found = student_t(by_seed)
+    ours = f"{plain:.0f} % (one seed) | {found.estimate:.0f} [{found.low:.0f}, {found.high:.0f}] %, with a critic |"
+    readme, page = (ROOT / "README.md").read_text(), (ROOT / "docs" / "studies" / "ogbench.md").read_text()
+    published = page.split("| FQL; IDQL; IFQL |")[1].split("\n")[0].strip("| ").split(";")[0]
+    assert f"| FQL, as published, {published} % | {ours}\n" in readme
