@@ -32,7 +32,7 @@ help:
 	@echo "make lowest   tests of each part with the lowest versions that pyproject.toml allows; make highest: the highest"
 	@echo "make newest   tests of the package without robosuite on the newest Python here, with constraints-numpy2.txt: a minute"
 	@echo "make audit    ask for known vulnerabilities of the pinned versions; needs the network"
-	@echo "make licences write the table of docs/licences.md anew"
+	@echo "make licences write docs/licences.csv anew"
 	@echo "make docs     the report of results/suite.csv as docs/report.md, and the site, into build/site"
 	@echo "make dist     source distribution and wheel, into dist/; for PyPI with ADDRESS=https://github.com/OWNER/sb3_dtfm"
 	@echo "make format   rewrite the sources in the project's format"
@@ -134,11 +134,10 @@ newest: $(TOOLS)/installed
 audit: install $(TOOLS)/installed
 	$(TOOLS)/bin/pip-audit --strict --disable-pip --no-deps -r constraints.txt
 
-# The pinned packages alone: CUDA's, which PyTorch brings on some platforms, are left to the page's text.
+# The pinned packages alone: CUDA's, which PyTorch brings on some platforms, are left to docs/licences.md.
 licences: install $(TOOLS)/installed
-	sed -i '/^| Name/,$$d' docs/licences.md
-	$(TOOLS)/bin/pip-licenses --python $(BIN)/python --from=mixed --with-system --format=markdown \
-		--packages $$(sed '/^#/d; s/==.*//' constraints.txt | sort -u) | sed 's/  *|/ |/g; s/----*/---/g' >> docs/licences.md
+	$(TOOLS)/bin/pip-licenses --python $(BIN)/python --from=mixed --with-system --format=csv \
+		--packages $$(sed '/^#/d; s/==.*//' constraints.txt | sort -u) > docs/licences.csv
 
 # Strict: a link or an anchor that leads nowhere is an error.
 docs: $(TOOLS)/installed linked

@@ -12,7 +12,7 @@ from minari.serialization import deserialize_space
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_dtfm.algorithms.saved_options import STRUCTURED, check_dataset_kwargs, check_text
+from sb3_dtfm.algorithms.saved_options import STRUCTURED, check_controller_settings, check_dataset_kwargs, check_text
 from sb3_dtfm.algorithms.saving import (
     ENCODED,
     EXTRACTOR_KWARGS,
@@ -150,6 +150,7 @@ def read_saved(
         attributes["policy_class"] = _policy_class(policies, taken("policy_class", str), source)
     with wrap_file_errors(source):
         check_dataset_kwargs(attributes.get("dataset_kwargs"))
+        check_controller_settings(attributes.get("controller"))
         for name in STRUCTURED:
             check_text(attributes.get(name), name)
     attributes.update({name: each for name, each in custom_objects.items() if name in {*attributes, *ENCODED}})
@@ -184,8 +185,6 @@ def _check_attributes(attributes: Mapping[str, Any], source: str) -> None:
         raise ModelFileError(f"{source}: return_reference is {returns}, expected {', '.join(ReturnReference._fields)}.")
     if not isinstance(actor := attributes.get("online_actor"), dict | None):
         raise ModelFileError(f"{source}: online_actor is {actor!r:.40}, expected its settings, or None.")
-    if not isinstance(controller := attributes.get("controller"), dict | None):
-        raise ModelFileError(f"{source}: controller is {controller!r:.40}, expected settings by robosuite's names, or None.")
     with wrap_file_errors(source):
         check_arguments(attributes, {name: rule for name, rule in SAVED.items() if name in attributes})
     observation, action = attributes["observation_space"], attributes["action_space"]

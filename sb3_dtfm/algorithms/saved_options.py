@@ -5,6 +5,7 @@ from typing import Any
 
 from sb3_dtfm.arguments import COUNT, Choice, Listed, Number, Rule, Text, check_arguments
 from sb3_dtfm.data.readers import check_options
+from sb3_dtfm.envs.robosuite import arm_motion
 
 STRUCTURED = ("policy_kwargs", "dataset_kwargs", "score_reference", "return_reference", "controller", "online_actor")
 # Options of `dataset_kwargs` that a file may hold; the loading user says where a cache lies and whether a pickle may run.
@@ -41,6 +42,26 @@ def check_dataset_kwargs(given: Any) -> None:
         check_arguments(given, {name: rule for name, rule in READER_OPTIONS.items() if name in given})
     except ValueError as error:
         raise ValueError(f"dataset_kwargs: {error}") from error
+
+
+def check_controller_settings(given: Any) -> None:
+    """
+    Check a controller as a file holds it.
+
+    :param given: see :func:`~sb3_dtfm.envs.robosuite.arm_motion`, or None
+    :raises ValueError: names the setting, what was found and what is accepted
+    """
+    if given is None:
+        return
+    if not isinstance(given, dict):
+        raise ValueError(f"controller is {given!r:.40}, expected settings by robosuite's names, or None.")
+    names = arm_motion({}).keys()
+    for name in sorted(given.keys() - names):
+        raise ValueError(f"controller: {name!r:.40} is no setting; accepted: {', '.join(names)}.")
+    for name, value in given.items():
+        entries = value if isinstance(value, list) else [value]
+        if not all(each is None or isinstance(each, str | bool | int) or Number().accepts(each) for each in entries):
+            raise ValueError(f"controller: {name} is {value!r:.40}, expected a number, text, or a list of such.")
 
 
 def check_text(value: Any, name: str) -> None:

@@ -13,7 +13,13 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
-from sb3_dtfm.algorithms.saved_options import DATASET_OPTIONS, STRUCTURED, check_dataset_kwargs, check_text
+from sb3_dtfm.algorithms.saved_options import (
+    DATASET_OPTIONS,
+    STRUCTURED,
+    check_controller_settings,
+    check_dataset_kwargs,
+    check_text,
+)
 from sb3_dtfm.files import printable
 from sb3_dtfm.optimization import RunningMeans
 from sb3_dtfm.policies import SequencePolicy
@@ -80,6 +86,8 @@ def to_configuration(
             plain = _json(value)
             if name == "dataset_kwargs":
                 check_dataset_kwargs(plain)
+            if name == "controller":
+                check_controller_settings(plain)
             if name in STRUCTURED:
                 check_text(plain, name)
             saved[name] = plain

@@ -5,7 +5,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_dtfm.zoo import commands
-from sb3_dtfm.zoo.arguments import UsageError, check_algorithm, import_packages, restored_arguments, resumed_run
+from sb3_dtfm.zoo.arguments import (
+    UsageError,
+    check_algorithm,
+    check_env_id,
+    import_packages,
+    restored_arguments,
+    resumed_run,
+)
 from sb3_dtfm.zoo.registration import finetuning_config, register
 from sb3_dtfm.zoo.resuming import Start
 
@@ -43,7 +50,9 @@ def main(argv: Sequence[str]) -> None:
         argv = Start.read(resumed, "finetune").arguments
     options, rest = parser.parse_known_args(argv)
     check_algorithm(options.algo)
-    import_packages(options.gym_packages if restored is None else [])
+    if restored is None:
+        check_env_id(options.env)
+        import_packages(options.gym_packages)
     if "-optimize" in rest or "--optimize-hyperparameters" in rest:
         raise UsageError("-optimize: hyperparameters of finetune cannot be searched; -params changes them.")
     if options.dataset:
@@ -51,6 +60,8 @@ def main(argv: Sequence[str]) -> None:
             "--dataset: refused, as the DTFM's own dataset is used; -params dataset:... names another for --algo dtfm."
         )
     config = options.conf_file or finetuning_config(options.algo)
+    if options.env is not None:
+        rest += ["--env", options.env]
     if options.gym_packages:
         rest += ["--gym-packages", *options.gym_packages]
     given = ["--algo", options.algo, "--conf-file", str(config), "--eval-episodes", str(options.eval_episodes)]
@@ -72,6 +83,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     argument = parser.add_argument
     argument("--model", required=True, type=Path, help="zip file of a DTFM, or folder of its run of `train`")
+    argument("--env", metavar="ENV", help="Gymnasium id")
     argument("--algo", default="sac", help="dtfm, sac, tqc or ppo, or with a --conf-file a2c or trpo; sac by default")
     argument("--target-return", type=float, help="in reward units; the model's by default")
     argument("-conf", "--conf-file", help="the packaged settings if not given, else a YAML file or a Python package")

@@ -216,7 +216,7 @@ def test_options_of_the_data_are_saved_or_named(cheetah_buffer, tmp_path):
     assert DT.load(tmp_path / "model").dataset_kwargs == expected
     mine = {"observation_space": model.observation_space}
     assert DT.load(tmp_path / "model", custom_objects={"dataset_kwargs": mine}).dataset_kwargs == mine
-    model.controller = {"robot": "two\nlines"}
+    model.controller = {"robots": "two\nlines"}
     with pytest.warns(UserWarning, match="controller is no part of a saved model: controller holds .*text without control"):
         model.save(tmp_path / "model", exclude=["dataset_kwargs"])
     assert DT.load(tmp_path / "model").controller is None
@@ -369,7 +369,10 @@ BAD_CONFIGURATIONS = [
     (("attributes", "dataset_kwargs"), {"action_bounds": "x"}, "action_bounds must be a list of 2 entries"),
     (("attributes", "dataset_kwargs"), [], "dataset_kwargs are []"),
     (("attributes", "dataset_kwargs"), {"observation_keys": ["\x1b[2J"]}, "dataset_kwargs holds '\\x1b[2J'; text without"),
-    (("attributes", "controller"), {"\x1b[2J": 1}, "controller holds '\\x1b[2J'; text without"),
+    (("attributes", "controller"), {"\x1b[2J": 1}, r"controller: '\x1b[2J' is no setting; accepted: type, output_min"),
+    (("attributes", "controller"), {"kp": {"a": 1}}, "controller: kp is {'a': 1}, expected a number, text, or a list"),
+    (("attributes", "controller"), {"kp": [[1]]}, "controller: kp is [[1]], expected a number, text, or a list"),
+    (("attributes", "controller"), {"robots": "\x1b[2J"}, "controller holds '\\x1b[2J'; text without"),
     (("attributes", "score_reference"), [0.0, 1.0, "\x1b[2J"], "score_reference holds '\\x1b[2J'; text without"),
     (("attributes", "n_episodes"), 10**30, "n_episodes must be"),
     (("attributes", "online_actor"), 5, "online_actor is 5, expected its settings, or None"),

@@ -398,7 +398,7 @@ RUNS_NOTHING = {
     ),
     "finetune --env MODULE:ID": (
         [*COMMANDS["finetune"], "--env", f"{PLANTED}:HalfCheetah-v5"],
-        "not found in gym registry",
+        f"--gym-packages {PLANTED} --env HalfCheetah-v5",
     ),
     **{
         f"{command} --env MODULE:ID": (
