@@ -12,7 +12,7 @@ from minari.serialization import deserialize_space
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_dtfm.algorithms.saved_options import STRUCTURED, check_controller_settings, check_dataset_kwargs, check_text
+from sb3_dtfm.algorithms.saved_options import STRUCTURED, check_structured
 from sb3_dtfm.algorithms.saving import (
     ENCODED,
     EXTRACTOR_KWARGS,
@@ -149,10 +149,8 @@ def read_saved(
     if "policy_class" not in custom_objects:
         attributes["policy_class"] = _policy_class(policies, taken("policy_class", str), source)
     with wrap_file_errors(source):
-        check_dataset_kwargs(attributes.get("dataset_kwargs"))
-        check_controller_settings(attributes.get("controller"))
         for name in STRUCTURED:
-            check_text(attributes.get(name), name)
+            check_structured(name, attributes.get(name))
     attributes.update({name: each for name, each in custom_objects.items() if name in {*attributes, *ENCODED}})
     _check_attributes(attributes, source)
     return SavedModel(attributes, tensors, source)

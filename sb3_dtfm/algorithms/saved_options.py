@@ -24,6 +24,21 @@ READER_OPTIONS: dict[str, Rule] = {
 }
 
 
+def check_structured(name: str, value: Any) -> None:
+    """
+    Check an attribute of :data:`STRUCTURED` as a file holds it.
+
+    :param name: of the attribute
+    :param value: plain values
+    :raises ValueError: names the attribute, what was found and what is accepted
+    """
+    if name == "dataset_kwargs":
+        check_dataset_kwargs(value)
+    if name == "controller":
+        check_controller_settings(value)
+    check_text(value, name)
+
+
 def check_dataset_kwargs(given: Any) -> None:
     """
     Check options as a file holds them.

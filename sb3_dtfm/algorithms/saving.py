@@ -16,8 +16,7 @@ from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, Line
 from sb3_dtfm.algorithms.saved_options import (
     DATASET_OPTIONS,
     STRUCTURED,
-    check_controller_settings,
-    check_dataset_kwargs,
+    check_structured,
     check_text,
 )
 from sb3_dtfm.files import printable
@@ -84,12 +83,8 @@ def to_configuration(
             if name not in known:
                 raise ValueError("files hold a model's settings and progress, and a subclass's constructor arguments")
             plain = _json(value)
-            if name == "dataset_kwargs":
-                check_dataset_kwargs(plain)
-            if name == "controller":
-                check_controller_settings(plain)
             if name in STRUCTURED:
-                check_text(plain, name)
+                check_structured(name, plain)
             saved[name] = plain
         except (TypeError, ValueError) as error:
             problem = f"{name} is no part of a saved model: {error}"
