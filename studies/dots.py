@@ -6,10 +6,12 @@ A study's table as a picture: a line for each row, dots for the numbers of a col
     python studies/dots.py docs/studies/ogbench.md mean published --label "success on average of five tasks, %"
     python studies/dots.py docs/studies/pusht.md solved --label "episodes solved, %"
 
-Columns are named by how their titles begin. The picture is written beside the page, under its name.
+Columns are named by how their titles begin. The picture is written beside the page, under its name. Its comment
+holds the cells that it shows, which a test compares with the page.
 """
 
 import argparse
+import json
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -47,6 +49,21 @@ def read_table(page: Path) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in plain]
 
 
+def shown(page: Path, columns: list[str]) -> list[list[str]]:
+    """
+    Cells of the first and of the chosen columns, without the lines that have no number there.
+
+    :param page: of the table
+    :param columns: how their titles begin
+    :return: the titles, then the lines
+    """
+    titles, *rows = read_table(page)
+    places = [[i for i, title in enumerate(titles) if title.startswith(name)] for name in columns]
+    chosen = [min(found, key=lambda i: len(titles[i])) for found in places]
+    rows = [cells for cells in rows if any(read_cell(cells[column]).values for column in chosen)]
+    return [[cells[column] for column in (0, *chosen)] for cells in (titles, *rows)]
+
+
 def draw(page: Path, columns: list[str], label: str) -> Path:
     """
     :param page: of the table
@@ -54,28 +71,25 @@ def draw(page: Path, columns: list[str], label: str) -> Path:
     :param label: of the axis
     :return: the PNG
     """
-    titles, *rows = read_table(page)
-    places = [[i for i, title in enumerate(titles) if title.startswith(name)] for name in columns]
-    chosen = [min(found, key=lambda i: len(titles[i])) for found in places]
-    rows = [cells for cells in rows if any(read_cell(cells[column]).values for column in chosen)]
+    titles, *rows = cells = shown(page, columns)
     figure = Figure(figsize=(8.0, 0.32 * len(rows) + 1.2), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
-    for number, column in enumerate(chosen):
-        axes.plot([], [], "o", color=f"C{number}", label=titles[column])
-        for row, cells in enumerate(rows):
-            y = row + 0.5 * ((number + 0.5) / len(chosen) - 0.5)
-            values, interval = read_cell(cells[column])
+    for number, title in enumerate(titles[1:]):
+        axes.plot([], [], "o", color=f"C{number}", label=title)
+        for row, (_, *texts) in enumerate(rows):
+            y = row + 0.5 * ((number + 0.5) / len(texts) - 0.5)
+            values, interval = read_cell(texts[number])
             axes.plot(values, [y] * len(values), "o", color=f"C{number}", markersize=4.5, fillstyle="none")
             if interval:
                 axes.plot(interval, [y, y], color=f"C{number}", linewidth=1.2)
-    axes.set_yticks(range(len(rows)), [cells[0].removeprefix("... ") for cells in rows])
+    axes.set_yticks(range(len(rows)), [name.removeprefix("... ") for name, *_ in rows])
     axes.set(xlabel=label, xlim=(min(0.0, axes.get_xlim()[0]), None), ylim=(len(rows) - 0.5, -0.5))
     axes.grid(axis="y", alpha=0.3)
-    if len(chosen) > 1:
-        figure.legend(loc="outside upper center", ncols=len(chosen), frameon=False)
+    if len(columns) > 1:
+        figure.legend(loc="outside upper center", ncols=len(columns), frameon=False)
     output = page.with_suffix(".png")
-    figure.savefig(output, dpi=100)
+    figure.savefig(output, dpi=100, metadata={"Comment": json.dumps(cells)})
     return output
 
 

@@ -1,10 +1,13 @@
 """A picture shows the numbers of a page's table."""
 
+import json
+import shlex
 from pathlib import Path
 
 import dots
 import pytest
 from matplotlib.axes import Axes
+from PIL import Image
 
 PAGE = """# A study
 
@@ -56,8 +59,13 @@ def test_a_picture_has_a_dot_for_each_number_of_the_columns_and_no_line_without_
 
 
 @pytest.mark.parametrize("name", ["adroit", "expected-returns", "ogbench", "pusht"])
-def test_pages_have_tables_and_pictures(name):
+def test_a_picture_shows_its_pages_table(name):
+    """Drawn by the command that stands at the top of the script."""
     page = Path(__file__).parents[2] / "docs" / "studies" / f"{name}.md"
     assert f"({name}.png)" in page.read_text()
-    assert len(dots.read_table(page)) > 5
-    assert f"docs/studies/{name}.md" in dots.__doc__
+    (command,) = (line for line in dots.__doc__.splitlines() if page.name in line)
+    columns = shlex.split(command)[3 : -len(["--label", "text"])]
+    cells = dots.shown(page, columns)
+    assert len(cells) > 5
+    with Image.open(page.with_suffix(".png")) as picture:
+        assert json.loads(picture.text["Comment"]) == cells, command
