@@ -1,6 +1,7 @@
 """The wrapper that shows a sequence policy its target return and its time step, and the spaces that come with it."""
 
 import math
+import re
 import time
 from collections.abc import Mapping
 from typing import Any, NamedTuple, SupportsFloat
@@ -9,11 +10,12 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.env_util import unwrap_wrapper
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
     VecEnv,
     VecFrameStack,
     VecTransposeImage,
@@ -336,14 +338,24 @@ def check_vec_env(
             f"{name} must be wrapped in sb3_dtfm.envs.ReturnToGoWrapper, inside any vectorised environment: write {remedy}. "
             f"Its observation space is {env.observation_space}."
         )
-    for each in getattr(env.unwrapped, "envs", ()):
-        while isinstance(each, gym.Wrapper) and not isinstance(each, ReturnToGoWrapper | Monitor):
-            if isinstance(each, TimeLimit) and unwrap_wrapper(each, Monitor) is not None:
-                raise ValueError(
-                    f"{name} has its TimeLimit outside ReturnToGoWrapper and Monitor, where no evaluation sees its ends: "
-                    "write ReturnToGoWrapper(TimeLimit(env, max_episode_steps=N))."
-                )
-            each = each.env
+    if any(map(_is_cut_off_outside, _wrappers(env))):
+        raise ValueError(
+            f"{name} has its TimeLimit outside ReturnToGoWrapper and Monitor, where no evaluation sees its ends: "
+            "write ReturnToGoWrapper(TimeLimit(env, max_episode_steps=N))."
+        )
+
+
+def _wrappers(env: VecEnv) -> list[list[str]]:
+    """Names of each environment's wrappers from the outermost one in, also of those in processes of their own."""
+    if not isinstance(env.unwrapped, DummyVecEnv | SubprocVecEnv):
+        return []
+    return [re.findall(r"<(\w+)", described) for described in env.env_method("__str__")]
+
+
+def _is_cut_off_outside(wrappers: list[str]) -> bool:
+    """Whether a TimeLimit, which RL-Zoo makes a PatchedTimeLimit, stands outside a Monitor and a ReturnToGoWrapper."""
+    inside = [number for number, name in enumerate(wrappers) if name in (ReturnToGoWrapper.__name__, Monitor.__name__)]
+    return Monitor.__name__ in wrappers and any(name.endswith("TimeLimit") for name in wrappers[: min(inside)])
 
 
 def known_task(env: VecEnv) -> Task | None:

@@ -73,9 +73,12 @@ class AdroitReward(gym.RewardWrapper, RecordConstructorArgs):
         return float(reward) - 0.2 * float(np.linalg.norm(task.data.site_xpos[palm] - position))
 
 
+_warned_of: set[str] = set()
+
+
 def warn_of_reward(env: gym.Env) -> None:
     """
-    Warn of a task whose reward is not the published one, where no :class:`AdroitReward` mends it.
+    Warn once of a task whose reward is not the published one, where no :class:`AdroitReward` mends it.
 
     :param env: perhaps in wrappers
     """
@@ -84,9 +87,11 @@ def warn_of_reward(env: gym.Env) -> None:
         if isinstance(inner, AdroitReward):
             return
         inner = inner.env
-    if _object(env) is not None:
+    name = str(env.spec.id if env.spec else env)
+    if _object(env) is not None and name not in _warned_of:
+        _warned_of.add(name)
         warnings.warn(
-            f"{env.spec.id if env.spec else env} rewards distance between palm and object, where its authors punish it, "
+            f"{name} rewards distance between palm and object, where its authors punish it, "
             "since gymnasium-robotics 1.2.1. sb3_dtfm.envs.AdroitReward(env) has their reward; data of people have it, too.",
             stacklevel=3,
         )

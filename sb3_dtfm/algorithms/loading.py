@@ -217,9 +217,10 @@ def _to_learning_rate(saved: Any, source: str) -> Any:
 
 def _to_means(saved: dict[str, Any], source: str) -> RunningMeans:
     n_values, sums = saved.get("n_values", -1), saved.get("sums")
-    numbers = sums.values() if isinstance(sums, dict) else [None]
+    named = isinstance(sums, dict) and all(map(str.isidentifier, sums))
+    numbers = sums.values() if isinstance(sums, dict) and named else [None]
     if not WHOLE.accepts(n_values) or not all(map(Number().accepts, numbers)) or bool(n_values) != bool(sums):
-        raise ModelFileError(f"{source}: means are {saved}, expected sums of a number of values.")
+        raise ModelFileError(f"{source}: means are {saved}, expected sums of a number of values, by their names.")
     return RunningMeans(sums, n_values)
 
 

@@ -15,6 +15,8 @@ from sb3_dtfm.data.trajectories import DatasetError, check_real, check_size, wra
 # Links one after the other that are followed at most, which is HDF5's own limit.
 MOST_LINKS = 16
 CHECKSUM = 4  # bytes that Fletcher's filter adds to a chunk
+# Filters by name that unpack what is cut off without an error, so that nobody can tell.
+UNKNOWN_LENGTH = {h5py.h5z.FILTER_SZIP: "szip", h5py.h5z.FILTER_NBIT: "nbit", h5py.h5z.FILTER_SCALEOFFSET: "scaleoffset"}
 # A run of up to 32 bytes behind its length, a short reference, or a long one with its length in the second byte.
 LZF_RUNS = [b"\\x%02x.{%d}" % (n, n + 1) for n in range(32)]
 LZF_TOKEN = re.compile(b"|".join([*LZF_RUNS, b"[\\x20-\\xdf].", b"[\\xe0-\\xff].."]), re.DOTALL)
@@ -147,6 +149,11 @@ def _check_chunks(data: h5py.h5d.DatasetID, shape: tuple[int, ...], what: str) -
     n_bytes = math.prod(chunk) * data.get_type().get_size()
     n_chunks = math.prod(-(-length // of_chunk) for length, of_chunk in zip(shape, chunk, strict=True))
     filters = [layout.get_filter(number)[0] for number in range(layout.get_nfilters())]
+    if unknown := [UNKNOWN_LENGTH[each] for each in filters if each in UNKNOWN_LENGTH]:
+        raise DatasetError(
+            f"{what} are stored with the filter {', '.join(unknown)}, by which HDF5 makes up numbers that are missing. gzip "
+            "and lzf are accepted: `h5repack -f GZIP=4 OLD NEW` writes gzip."
+        )
     n_found = data.get_num_chunks()
     if n_found < n_chunks:
         raise DatasetError(
@@ -166,7 +173,7 @@ def _check_chunk(data: h5py.h5d.DatasetID, info: h5py.h5d.StoreInfo, filters: li
         n_found = len(zlib.decompressobj().decompress(stored, n_bytes))
     elif packed == {h5py.h5z.FILTER_LZF}:
         n_found = _lzf_length(data.read_direct_chunk(info.chunk_offset)[1][:n_found])
-    elif packed:  # the length behind other filters is only known to HDF5
+    elif packed:  # another library's filter, which knows the length itself
         return
     if n_found < n_bytes:
         at = f"the chunk at {info.chunk_offset}"

@@ -89,6 +89,8 @@ def load_several(
     env_args: dict[str, Any] | None = None,
     max_episode_steps: int | None = None,
     allow_pickle: bool = False,
+    observation_keys: Sequence[str] | Mapping[str, str] | None = None,
+    clip_actions: bool = False,
 ) -> TrajectoryBuffer:
     """
     Several datasets of one task as one, in memory.
@@ -101,16 +103,20 @@ def load_several(
     :param env_args: see :func:`load_dataset`
     :param max_episode_steps: see :func:`load_dataset`
     :param allow_pickle: see :func:`load_dataset`
+    :param observation_keys: see the reader of each
+    :param clip_actions: see the reader of each
     :raises DatasetError: one of them cannot be read, or is of another task; a weight that is no positive number
     """
     buffers, weights = [], []
+    shared: dict[str, Any] = {"action_space": action_space, "observation_space": observation_space, "env_id": env_id}
+    shared.update(env_args=env_args, max_episode_steps=max_episode_steps, allow_pickle=allow_pickle)
+    of_readers = {"observation_keys": observation_keys, "clip_actions": clip_actions}
+    shared.update({name: value for name, value in of_readers.items() if value})
     for each in datasets:
         options = without_pickles(each) if is_mapping(each) and "dataset" in each else {"dataset": each}
         dataset, weight = options.pop("dataset"), options.pop("weight", 1.0)
         if not POSITIVE.accepts(weight):
             raise DatasetError(f"dataset {dataset!s}: weight is {weight!r}; a positive number is accepted.")
-        shared: dict[str, Any] = {"action_space": action_space, "observation_space": observation_space, "env_id": env_id}
-        shared.update(env_args=env_args, max_episode_steps=max_episode_steps, allow_pickle=allow_pickle)
         buffers.append(load_dataset(dataset, **{**shared, **options}))
         weights.append(float(weight))
     return TrajectoryBuffer.join(buffers, weights)

@@ -180,7 +180,8 @@ class _Reader:
         configuration = self.configuration()
         about = self._members(configuration, {f"{group}{TENSORS_SUFFIX}" for group in groups})
         if print_system_info:
-            print(f"== SAVED MODEL SYSTEM INFO ==\n{self._content(SYSTEM_INFO, MAX_CONFIGURATION).decode(errors='replace')}")
+            lines = self._content(SYSTEM_INFO, MAX_CONFIGURATION).decode(errors="replace").split("\n")
+            print("== SAVED MODEL SYSTEM INFO ==", *map(printable, lines), sep="\n")
         tensors = {name.removesuffix(TENSORS_SUFFIX): self._tensors(name, claimed) for name, claimed in about.items()}
         if device.type != "cpu":
             tensors = {group: {name: each.to(device) for name, each in of.items()} for group, of in tensors.items()}

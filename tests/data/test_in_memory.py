@@ -149,7 +149,12 @@ def test_an_unfit_episode_can_be_dropped_and_actions_clipped():
         assert load_dataset([{"obs": OBS}, {"obs": OBS, "acts": ACTS[:, 0]}, good], on_invalid="drop").n_episodes == 1
     with pytest.raises(DatasetError, match="episode 1: has no array called one of actions"):
         load_dataset([{"obs": OBS}] * 2, on_invalid="drop")
-    assert load_dataset([{"obs": OBS, "acts": 9 * ACTS}], clip_actions=True).actions.abs().max() == 1.0
+    replay_buffer = ReplayBuffer(5, spaces.Box(-1, 1, (2,)), spaces.Box(-1, 1, (2,)), device="cpu")
+    for step in range(3):
+        replay_buffer.add(*np.zeros((2, 1, 2), np.float32), np.full((1, 2), 9.0), np.ones(1), np.array([step == 2]), [{}])
+    steps = [(np.zeros(2), np.full(2, 9.0), 1.0, t == 2) for t in range(3)]
+    for given in ([{"obs": OBS, "acts": 9 * ACTS}], steps, replay_buffer):
+        assert load_dataset(given, clip_actions=True).actions.abs().max() == 1.0
 
 
 def test_rewards_that_are_made_up_although_something_was_there_are_told_of():

@@ -68,6 +68,13 @@ def test_episodes_are_what_was_written(version, tmp_path):
     assert DT("MultiInputPolicy", dataset=str(tmp_path / "arm"), device="cpu").buffer.n_episodes == 3
 
 
+def test_actions_outside_of_the_bounds_are_refused_or_clipped(tmp_path):
+    folder = write(tmp_path / "arm")
+    with pytest.raises(DatasetError, match=r"outside of the action space \[-10, 10\]"):
+        load_dataset(folder, action_bounds=(-10, 10))
+    assert load_dataset(folder, action_bounds=(-10, 10), clip_actions=True).actions.abs().max() == 10.0
+
+
 def test_rewards_and_successes(tmp_path):
     success = np.zeros(12, bool)
     success[[1, 7]] = True

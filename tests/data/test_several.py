@@ -43,6 +43,19 @@ def test_what_leaves_nothing_is_refused():
         load_dataset(arrays(0.0), best_share=0)
 
 
+def test_keys_and_clipping_count_for_all_of_several(tmp_path):
+    path = tmp_path / "some.npz"
+    given = {**arrays(0.0), "acts": np.full((9, 2), 9.0), "speed": np.arange(9.0)}
+    np.savez(path, **given)
+    buffer = load_dataset([path, given], observation_keys=["speed"], clip_actions=True)
+    assert buffer.observations.shape == (18, 1)
+    assert buffer.actions.max() == 1.0
+    own = load_dataset(
+        [path, {"dataset": given, "observation_keys": ["rews"]}], observation_keys=["speed"], clip_actions=True
+    )
+    assert own.observations[9:].flatten().tolist() == given["rews"].tolist()
+
+
 def test_several_are_one_and_each_is_drawn_by_its_weight(tmp_path):
     path = tmp_path / "some.npz"
     np.savez(path, **arrays(0.0))

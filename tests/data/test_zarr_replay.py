@@ -53,6 +53,13 @@ def test_a_folder_and_a_zip_hold_the_same_episodes(arrays, tmp_path):
         assert buffer.terminated.all()
 
 
+def test_actions_outside_of_the_bounds_are_refused_or_clipped(arrays, tmp_path):
+    path = write(tmp_path / "push.zarr", {**arrays, "data/reward": np.zeros(N)})
+    with pytest.raises(DatasetError, match=r"outside of the action space \[0, 100\]"):
+        load_dataset(path, action_bounds=(0, 100))
+    assert load_dataset(path, action_bounds=(0, 100), clip_actions=True).actions.max() == 100.0
+
+
 def test_the_environments_names_and_some_columns(arrays, tmp_path):
     path = write(tmp_path / "push.zarr", arrays)
     buffer = load(path, observation_keys={"pixels": "img", "agent_pos": "state[:2]"}, cache_dir=tmp_path / "cache")

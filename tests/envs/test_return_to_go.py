@@ -281,9 +281,23 @@ def test_an_evaluation_ends_where_a_time_limit_stands_outside_the_monitor(vec_en
     assert lengths == [7, 7]
 
 
-def test_a_time_limit_outside_of_everything_is_refused():
-    bare = ConstantReward(spaces.Box(-1.0, 1.0, (2,)), np.zeros(2, np.float32))
+@pytest.mark.parametrize("vec_env_class", [DummyVecEnv, SubprocVecEnv])
+def test_a_time_limit_outside_of_everything_is_refused(vec_env_class):
+    def bare() -> gym.Env:
+        return ConstantReward(spaces.Box(-1.0, 1.0, (2,)), np.zeros(2, np.float32))
+
+    def check(*makers) -> None:
+        env = vec_env_class(list(makers))
+        try:
+            check_vec_env(env)
+        finally:
+            env.close()
+
+    good = [
+        lambda: Monitor(TimeLimit(ReturnToGoWrapper(bare(), 1.0), 7)),
+        lambda: TimeLimit(ReturnToGoWrapper(bare(), 1.0), 7),
+        lambda: ReturnToGoWrapper(TimeLimit(Monitor(bare()), 7), 1.0),
+    ]
+    check(*good)
     with pytest.raises(ValueError, match=r"write ReturnToGoWrapper\(TimeLimit\(env, max_episode_steps=N\)\)"):
-        check_vec_env(DummyVecEnv([lambda: TimeLimit(ReturnToGoWrapper(Monitor(bare), 1.0), 7)]))
-    check_vec_env(DummyVecEnv([lambda: Monitor(TimeLimit(ReturnToGoWrapper(bare, 1.0), 7))]))
-    check_vec_env(DummyVecEnv([lambda: TimeLimit(ReturnToGoWrapper(bare, 1.0), 7)]))
+        check(*good, lambda: TimeLimit(ReturnToGoWrapper(Monitor(bare()), 1.0), 7))

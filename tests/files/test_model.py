@@ -310,6 +310,7 @@ BAD_CONFIGURATIONS = [
     (("learning_rate",), {"__class__": 1}, "expected start, end and end_fraction"),
     (("means",), {"n_values": -1, "sums": {}}, "means are"),
     (("means",), {"n_values": 1, "sums": {"loss": "x"}}, "means are"),
+    (("means",), {"n_values": 1, "sums": {"rollout/ep_rew_mean": 1.0}}, "of a number of values, by their names"),
     (("attributes",), [], "attributes is []"),
     (("attributes", "predict"), 1, "'predict' is no attribute"),
     (("attributes", "learn"), {}, "'learn' is no attribute"),
@@ -458,6 +459,13 @@ def test_members_that_are_missing_too_many_or_not_what_they_claim_are_refused(sa
     claims = struct.pack("<Q", 2**62) + parts["policy.safetensors"][8:]
     forged_header = forged(packed({**parts, "policy.safetensors": claims}), lambda configuration: None)
     assert "policy.safetensors" in refused(forged_header, tmp_path)
+
+
+def test_what_a_file_was_saved_with_is_printed_without_control_characters(saved, tmp_path, capsys):
+    lines = packed({**members(saved), "system_info.txt": b"- OS: Linux\n- \x1b[2J\r"})
+    (tmp_path / "model.zip").write_bytes(forged(lines, lambda configuration: None))
+    DTFM.load(tmp_path / "model.zip", print_system_info=True)
+    assert "- OS: Linux\n- \\x1b[2J\\r\n" in capsys.readouterr().out
 
 
 def test_a_directory_that_leads_nowhere_is_refused(saved, tmp_path):
