@@ -14,7 +14,6 @@ from stable_baselines3.common.env_util import unwrap_wrapper
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from stable_baselines3.common.vec_env import (
-    DummyVecEnv,
     SubprocVecEnv,
     VecEnv,
     VecFrameStack,
@@ -33,6 +32,8 @@ TIMESTEP = "timestep"
 IMAGE = "image"
 # Numbers of channels that images have.
 CHANNELS = (1, 3, 4)
+# Wrappers whose order decides whether an evaluation sees an episode's end.
+WRAPPERS = ("TimeLimit", "Monitor", "ReturnToGoWrapper")
 # In `info` after several actions: what was observed between them.
 BETWEEN = "observations_between"
 
@@ -338,7 +339,7 @@ def check_vec_env(
             f"{name} must be wrapped in sb3_dtfm.envs.ReturnToGoWrapper, inside any vectorised environment: write {remedy}. "
             f"Its observation space is {env.observation_space}."
         )
-    if any(map(_is_cut_off_outside, _wrappers(env))):
+    if any(kinds[:1] == ["TimeLimit"] and "Monitor" in kinds for kinds in _wrappers(env)):
         raise ValueError(
             f"{name} has its TimeLimit outside ReturnToGoWrapper and Monitor, where no evaluation sees its ends: "
             "write ReturnToGoWrapper(TimeLimit(env, max_episode_steps=N))."
@@ -346,16 +347,21 @@ def check_vec_env(
 
 
 def _wrappers(env: VecEnv) -> list[list[str]]:
-    """Names of each environment's wrappers from the outermost one in, also of those in processes of their own."""
-    if not isinstance(env.unwrapped, DummyVecEnv | SubprocVecEnv):
-        return []
-    return [re.findall(r"<(\w+)", described) for described in env.env_method("__str__")]
+    """
+    Wrappers of :data:`WRAPPERS` around each environment, from the outermost one in.
 
-
-def _is_cut_off_outside(wrappers: list[str]) -> bool:
-    """Whether a TimeLimit, which RL-Zoo makes a PatchedTimeLimit, stands outside a Monitor and a ReturnToGoWrapper."""
-    inside = [number for number, name in enumerate(wrappers) if name in (ReturnToGoWrapper.__name__, Monitor.__name__)]
-    return Monitor.__name__ in wrappers and any(name.endswith("TimeLimit") for name in wrappers[: min(inside)])
+    By the names of classes: RL-Zoo replaces Gymnasium's TimeLimit by a child of it, and an environment in a process of its
+    own only tells how it describes itself.
+    """
+    if isinstance(env.unwrapped, SubprocVecEnv):
+        return [re.findall(rf"<\w*?({'|'.join(WRAPPERS)})(?=<)", each) for each in env.env_method("__str__")]
+    found: list[list[str]] = []
+    for each in getattr(env.unwrapped, "envs", ()):
+        found.append([])
+        while isinstance(each, gym.Wrapper):
+            found[-1] += [base.__name__ for base in type(each).__mro__ if base.__name__ in WRAPPERS][:1]
+            each = each.env
+    return found
 
 
 def known_task(env: VecEnv) -> Task | None:

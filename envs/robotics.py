@@ -73,7 +73,7 @@ class AdroitReward(gym.RewardWrapper, RecordConstructorArgs):
         return float(reward) - 0.2 * float(np.linalg.norm(task.data.site_xpos[palm] - position))
 
 
-_warned_of: set[str] = set()
+_warned_of: set[str] = set()  # ids of tasks
 
 
 def warn_of_reward(env: gym.Env) -> None:
@@ -87,11 +87,10 @@ def warn_of_reward(env: gym.Env) -> None:
         if isinstance(inner, AdroitReward):
             return
         inner = inner.env
-    name = str(env.spec.id if env.spec else env)
-    if _object(env) is not None and name not in _warned_of:
-        _warned_of.add(name)
+    if env.spec is not None and _object(env) is not None and env.spec.id not in _warned_of:
+        _warned_of.add(env.spec.id)
         warnings.warn(
-            f"{name} rewards distance between palm and object, where its authors punish it, "
+            f"{env.spec.id} rewards distance between palm and object, where its authors punish it, "
             "since gymnasium-robotics 1.2.1. sb3_dtfm.envs.AdroitReward(env) has their reward; data of people have it, too.",
             stacklevel=3,
         )

@@ -75,7 +75,7 @@ def check_controller_settings(given: Any) -> None:
         raise ValueError(f"controller: {name!r:.40} is no setting; accepted: {', '.join(names)}.")
     for name, value in given.items():
         entries = value if isinstance(value, list) else [value]
-        if not all(each is None or isinstance(each, str | bool | int) or Number().accepts(each) for each in entries):
+        if not all(each is None or isinstance(each, str | bool) or Number().accepts(each) for each in entries):
             raise ValueError(f"controller: {name} is {value!r:.40}, expected a number, text, or a list of such.")
 
 

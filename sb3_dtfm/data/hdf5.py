@@ -15,7 +15,7 @@ from sb3_dtfm.data.trajectories import DatasetError, check_real, check_size, wra
 # Links one after the other that are followed at most, which is HDF5's own limit.
 MOST_LINKS = 16
 CHECKSUM = 4  # bytes that Fletcher's filter adds to a chunk
-# Filters by name that unpack what is cut off without an error, so that nobody can tell.
+# Names of filters that unpack without an error what is cut off.
 UNKNOWN_LENGTH = {h5py.h5z.FILTER_SZIP: "szip", h5py.h5z.FILTER_NBIT: "nbit", h5py.h5z.FILTER_SCALEOFFSET: "scaleoffset"}
 # A run of up to 32 bytes behind its length, a short reference, or a long one with its length in the second byte.
 LZF_RUNS = [b"\\x%02x.{%d}" % (n, n + 1) for n in range(32)]

@@ -11,6 +11,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
@@ -266,6 +267,14 @@ def test_the_task_is_known_where_its_whole_spec_cannot_leave_a_process(vec_env_c
     assert known_task(DummyVecEnv([lambda: ReturnToGoWrapper(bare, target_return=0.0)])) is None
 
 
+class OwnTimeLimit(TimeLimit):
+    """As RL-Zoo has one."""
+
+
+class Horizon(TimeLimit):
+    """Another name, by which it is not known in a process of its own."""
+
+
 @pytest.mark.parametrize("vec_env_class", [DummyVecEnv, SubprocVecEnv])
 def test_an_evaluation_ends_where_a_time_limit_stands_outside_the_monitor(vec_env_class):
     def make() -> gym.Env:
@@ -274,7 +283,10 @@ def test_an_evaluation_ends_where_a_time_limit_stands_outside_the_monitor(vec_en
 
     env = vec_env_class([make])
     check_vec_env(env)
-    model = PPO("MultiInputPolicy", env, n_steps=8, batch_size=8, device="cpu")
+    evaluation = EvalCallback(vec_env_class([make]), n_eval_episodes=2, eval_freq=8, verbose=0)
+    model = PPO("MultiInputPolicy", env, n_steps=8, batch_size=8, device="cpu").learn(8, evaluation)
+    assert evaluation.last_mean_reward == pytest.approx(0.7)
+    evaluation.eval_env.close()
     returns, lengths = evaluate_policy(model, env, 2, return_episode_rewards=True)
     env.close()
     assert returns == pytest.approx([0.7, 0.7])
@@ -299,5 +311,7 @@ def test_a_time_limit_outside_of_everything_is_refused(vec_env_class):
         lambda: ReturnToGoWrapper(TimeLimit(Monitor(bare()), 7), 1.0),
     ]
     check(*good)
-    with pytest.raises(ValueError, match=r"write ReturnToGoWrapper\(TimeLimit\(env, max_episode_steps=N\)\)"):
-        check(*good, lambda: TimeLimit(ReturnToGoWrapper(Monitor(bare()), 1.0), 7))
+    limits = [TimeLimit, OwnTimeLimit, *([Horizon] if vec_env_class is DummyVecEnv else [])]
+    for limit in limits:
+        with pytest.raises(ValueError, match=r"write ReturnToGoWrapper\(TimeLimit\(env, max_episode_steps=N\)\)"):
+            check(*good, lambda limit=limit: limit(ReturnToGoWrapper(Monitor(bare()), 1.0), 7))

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sb3_dtfm.envs import AdroitReward, ReturnToGoWrapper, register_gymnasium_robotics
+from sb3_dtfm.envs import AdroitReward, ReturnToGoWrapper, register_gymnasium_robotics, robotics
 
 pytest.importorskip("gymnasium_robotics")
 register_gymnasium_robotics()
@@ -44,10 +44,12 @@ def test_a_door_that_is_shut_costs_what_its_authors_say():
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_the_reward_of_the_installed_version_is_warned_of(task, recwarn):
+def test_the_reward_of_the_installed_version_is_warned_of_once(task, recwarn, monkeypatch):
+    monkeypatch.setattr(robotics, "_warned_of", set())  # by tests before
     with pytest.warns(UserWarning, match=rf"{task} rewards distance between palm and object.*AdroitReward\(env\)"):
         ReturnToGoWrapper(gym.make(task), 1.0)
     recwarn.clear()
+    ReturnToGoWrapper(gym.make(task), 1.0)
     ReturnToGoWrapper(AdroitReward(gym.make(task)), 1.0)
     ReturnToGoWrapper(gym.make("AdroitHandPen-v1"), 1.0)
     assert not [each for each in recwarn if "palm" in str(each.message)]

@@ -372,6 +372,7 @@ BAD_CONFIGURATIONS = [
     (("attributes", "dataset_kwargs"), {"observation_keys": ["\x1b[2J"]}, "dataset_kwargs holds '\\x1b[2J'; text without"),
     (("attributes", "controller"), {"\x1b[2J": 1}, r"controller: '\x1b[2J' is no setting; accepted: type, output_min"),
     (("attributes", "controller"), {"kp": {"a": 1}}, "controller: kp is {'a': 1}, expected a number, text, or a list"),
+    (("attributes", "controller"), {"kp": 10**400}, "controller: kp is 1000"),
     (("attributes", "controller"), {"kp": [[1]]}, "controller: kp is [[1]], expected a number, text, or a list"),
     (("attributes", "controller"), {"robots": "\x1b[2J"}, "controller holds '\\x1b[2J'; text without"),
     (("attributes", "score_reference"), [0.0, 1.0, "\x1b[2J"], "score_reference holds '\\x1b[2J'; text without"),
