@@ -353,6 +353,20 @@ def short_chunk(
     return change
 
 
+def cut_chunk(**filters: Any) -> Callable[[h5py.File, str, Path], object]:
+    """Filters that fill a chunk up from a few of its bytes, where others tell that it is cut."""
+
+    def change(file: h5py.File, path: str, folder: Path) -> None:
+        array = file[path][()]
+        del file[path]
+        options = dict(chunks=(8, *array.shape[1:]), maxshape=(None, *array.shape[1:]), **filters)
+        data = file.create_dataset(path, data=array.astype(np.uint8) if array.dtype == bool else array, **options)
+        first = (0,) * array.ndim
+        data.id.write_direct_chunk(first, data.id.read_direct_chunk(first)[1][:8])
+
+    return change
+
+
 def linked(file: h5py.File, path: str, folder: Path) -> None:
     file.move(path, "/elsewhere")
     file[path] = h5py.SoftLink("/elsewhere")
@@ -376,6 +390,8 @@ HDF5: dict[str, tuple[Callable[[h5py.File, str, Path], object], str | None]] = {
     "a short compressed chunk": (short_chunk(zlib.compress(b"1"), compression="gzip"), None),
     "a short lzf chunk": (short_chunk(b"\x001", compression="lzf"), None),
     "a short chunk beside lzf": (short_chunk(b"1", filter_mask=1, compression="lzf"), None),
+    "a cut szip chunk": (cut_chunk(compression="szip"), None),
+    "a cut scaleoffset chunk": (cut_chunk(scaleoffset=4), None),
     "storage in another file": (external_storage, None),
     "virtual": (virtual, None),
     "unwritten": (unwritten, None),

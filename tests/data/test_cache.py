@@ -254,12 +254,15 @@ def test_a_damaged_cache_is_refused_with_what_to_do(name: str, damage: str, robo
         load(robomimic_file, tmp_path / "cache")
 
 
+N_FLIPPED = 60
+
+
 def test_no_flipped_byte_of_a_cache_is_learned_from(robomimic_file: Path, tmp_path: Path):
     """Refused, or built anew where the cache no longer says what it is of."""
     right = load(robomimic_file, None)
     load(robomimic_file, tmp_path / "cache")
     rng, refused = np.random.default_rng(0), 0
-    for _ in range(60):
+    for _ in range(N_FLIPPED):
         file = rng.choice(sorted(only_folder(tmp_path / "cache").iterdir()))
         content = bytearray(file.read_bytes())
         content[rng.integers(len(content))] ^= 1 << int(rng.integers(8))

@@ -18,17 +18,6 @@ GOOD = {
     **({"zarr": str(corpus.ZARR)} if importlib.util.find_spec("zarr") else {}),
 }
 CASES = corpus.cases()
-# The kinds of a row of docs/reliability.md.
-ROWS = {
-    "Minari": ("hdf5", "arrow", "parquet"),
-    "robomimic": ("robomimic",),
-    "`.npz`": ("npz",),
-    "D4RL": ("flat",),
-    "LeRobot": ("lerobot",),
-    "zarr": ("zarr",),
-    "CSV": ("csv",),
-    "Parquet": ("table",),
-}
 
 
 def load(folder: Path, kind: str, dataset: str | None = None, **options: str) -> TrajectoryBuffer:
@@ -59,17 +48,6 @@ def test_the_corpus_has_hundreds_of_datasets_of_each_reader():
     assert len({case.name for case in CASES}) == len(CASES) > 900
     kinds = [case.good for case in CASES]
     assert min(kinds.count(kind) for kind in ("hdf5", "robomimic", "npz", "flat", "lerobot", "zarr")) > 150
-
-
-def test_the_page_on_reliability_counts_them():
-    """A row for each kind: how many are refused, and how many are read."""
-    page = (Path(__file__).parents[2] / "docs" / "reliability.md").read_text()
-    read_of = {
-        title: [isinstance(case.expected, str) for case in CASES if case.good in kinds] for title, kinds in ROWS.items()
-    }
-    assert sum(map(len, read_of.values())) == len(CASES)
-    rows = [f"| {title} | {len(read) - sum(read)} | {sum(read)} |" for title, read in read_of.items()]
-    assert "\n".join(["| dataset | refused | read |", "| --- | --- | --- |", *rows]) in page
 
 
 def test_the_good_ones_are_the_same_in_every_format(read_right: dict[str, TrajectoryBuffer]):
@@ -142,13 +120,16 @@ def test_on_invalid_is_one_of_two(good: Path):
         load(good / "npz", "npz", on_invalid="skip")
 
 
+MISSING_SPACES = ((), ("observation_space",), ("action_space",), ("observation_space", "action_space"))
+
+
 def test_nothing_named_in_the_metadata_is_run(good: Path, tmp_path: Path):
     """Minari builds the environment of `env_spec` where a space is missing."""
     mark = tmp_path / "mark"
     spec = (
         f'{{"id": "A-v0", "entry_point": "os:system", "kwargs": {{"command": "touch {mark}"}}, "additional_wrappers": []}}'
     )
-    for number, missing in enumerate(((), ("observation_space",), ("action_space",), ("observation_space", "action_space"))):
+    for number, missing in enumerate(MISSING_SPACES):
         folder = shutil.copytree(good / "hdf5", tmp_path / str(number))
         corpus.metadata_change(env_spec=spec, **dict.fromkeys(missing, corpus.MISSING))(folder)
         if missing:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rl_zoo3.utils import get_trained_models
 
@@ -30,6 +31,18 @@ def test_what_changes_nothing_in_a_run_without_episodes_is_accepted(workplace):
     assert DT.load(RUN / "HalfCheetah-v5.zip").num_timesteps == 4
     assert not (RUN / "replay_buffer.pkl").exists()
     assert main(["enjoy", "--algo", "dt", "--env", "HalfCheetah-v5", "--no-render", "-n", "20"]) == 0
+
+
+@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
+def test_a_time_limit_outside_the_monitor_ends_evaluations(vec_env, workplace, capsys):
+    """RL-Zoo's Monitor never sees such an end, and an evaluation waits for one."""
+    limit = {"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 7}}
+    wrappers = f"env_wrapper:{[limit, 'sb3_dtfm.envs.ReturnToGoWrapper']}"
+    evaluations = ["--eval-freq", "4", "--eval-episodes", "2", "--vec-env", vec_env]
+    assert main(tiny_training("dt", wrappers, *SETTINGS, *evaluations)) == 0
+    assert np.load(RUN / "evaluations.npz")["ep_lengths"].tolist() == [[7, 7]] * 2
+    assert main(["enjoy", "--algo", "dt", "--env", "HalfCheetah-v5", "--no-render", "-n", "20"]) == 0
+    assert "Episode Length 7" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
