@@ -4,6 +4,7 @@ Time that a gradient step takes beside its matrix products alone: docs/performan
     OMP_NUM_THREADS=1 python studies/steps.py defaults             # what the data decide, a minute
     OMP_NUM_THREADS=1 python studies/steps.py sizes                # larger and smaller ones
     OMP_NUM_THREADS=1 python studies/steps.py sizes --before CHECKOUT --d3rlpy .venv-baselines/bin/python
+    OMP_NUM_THREADS=1 python studies/steps.py sizes --compile --repeats 1    # beside `compile=True`: a minute or two each
     OMP_NUM_THREADS=1 python studies/steps.py profile              # what defaults and the largest sizes spend their time on
 
 in turn with another version of this package, and with d3rlpy's Decision Transformer of the same width and depth, of which a
@@ -83,6 +84,7 @@ SIZES: dict[str, Step] = {
 STEPS = {**DEFAULTS, **SIZES}
 COLUMNS = {
     "gflop": "GFLOP", "products": "products, ms", "step": "step, ms", "ratio": "step / products",
+    "compiled": "compiled, ms", "compiled / now": "/ step", "compiling": "compiling, s",
     "auto": "before, auto, ms", "auto / now": "/ step", "float32": "before, float32, ms", "float32 / now": "/ step",
     "d3rlpy": "d3rlpy's DT, ms", "d3rlpy / now": "/ step",
 }  # fmt: skip
@@ -127,7 +129,7 @@ class Products(TorchDispatchMode):
         return 1e3 * statistics.median(times)
 
 
-def make_model(name: str, precision: str = "float32") -> OfflineAlgorithm:
+def make_model(name: str, precision: str = "float32", **options: Any) -> OfflineAlgorithm:
     """A model of random data with nothing left to decide."""
     step = STEPS[name]
     rng = np.random.default_rng(0)
@@ -143,7 +145,7 @@ def make_model(name: str, precision: str = "float32") -> OfflineAlgorithm:
     given = dict(batch_size=step.batch_size, context_length=step.context_length, return_weighting=0.0, ema_decay=0.999)
     return ALGORITHMS[step.algo](
         "MultiInputPolicy", dataset=dataset, policy_kwargs={**decided, **step.policy_kwargs}, precision=precision,
-        device="cpu", seed=0, **given,
+        device="cpu", seed=0, **given, **options,
     )  # fmt: skip
 
 
@@ -161,6 +163,20 @@ def measure(name: str, precision: str) -> dict[str, float]:
     return {"step": step, "products": min(before, after), "gflop": products.gflop()}
 
 
+def measure_compiled(name: str) -> dict[str, float]:
+    """Median processor time of a compiled step of `learn`, and seconds until the first one has ended."""
+    n_steps = 10 if STEPS[name].context_length == 20 else 200
+    model, stamps, start = make_model(name, compile=True), [], time.perf_counter()
+    model.learn(n_steps + 2, callback=lambda *_: stamps.append(clocks()) is None, log_interval=None)
+    waited, used = np.transpose(stamps)
+    return {"compiled": 1e3 * float(np.median(np.diff(used[1:]))), "compiling": waited[0] - start}
+
+
+def clocks() -> tuple[float, float]:
+    """Seconds of the clock and of the processor."""
+    return time.perf_counter(), time.process_time()
+
+
 def profile(name: str) -> dict[str, float]:
     """Shares of a gradient step's processor time by `KINDS`, the first that fits; the rest is everything else."""
     model = make_model(name)
@@ -175,9 +191,9 @@ def profile(name: str) -> dict[str, float]:
     return {kind: time_spent / sum(times.values()) for kind, time_spent in found.items()}
 
 
-def run(name: str, checkout: Path, precision: str = "float32") -> dict[str, float]:
+def run(name: str, checkout: Path, *options: str) -> dict[str, float]:
     """A measurement in a process of its own."""
-    command = [sys.executable, __file__, "one", "--name", name, "--precision", precision]
+    command = [sys.executable, __file__, "one", "--name", name, *options]
     environment = {**os.environ, "PYTHONPATH": str(checkout)}
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=environment)
     return json.loads(done.stdout.splitlines()[-1])
@@ -204,8 +220,11 @@ def line(name: str, options: argparse.Namespace) -> str:
         keep(**now, ratio=now["step"] / now["products"])
         if options.before:
             for precision in ("auto", "float32"):
-                before = run(name, options.before.resolve(), precision)["step"]
+                before = run(name, options.before.resolve(), "--precision", precision)["step"]
                 keep(**{precision: before, f"{precision} / now": before / now["step"]})
+        if options.compile:
+            compiled = run(name, HERE, "--compile")
+            keep(**compiled, **{"compiled / now": compiled["compiled"] / now["step"]})
         if options.d3rlpy and STEPS[name].context_length == 20:
             baseline = run_d3rlpy(options.d3rlpy.absolute(), STEPS[name])
             keep(d3rlpy=baseline, **{"d3rlpy / now": baseline / now["step"]})
@@ -219,12 +238,14 @@ def main() -> None:
     parser.add_argument("what", choices=("defaults", "sizes", "profile", "one"))
     parser.add_argument("--before", type=Path, metavar="CHECKOUT")
     parser.add_argument("--d3rlpy", type=Path, metavar="PYTHON", help="of an environment that has d3rlpy")
+    parser.add_argument("--compile", action="store_true", help="compiled steps, too")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--name", help=argparse.SUPPRESS)
-    parser.add_argument("--precision", help=argparse.SUPPRESS)
+    parser.add_argument("--precision", default="float32", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.what == "one":
-        print(json.dumps(measure(options.name, options.precision)))
+        one = measure_compiled(options.name) if options.compile else measure(options.name, options.precision)
+        print(json.dumps(one))
         return
     if options.what == "profile":
         for name in (*DEFAULTS, *list(SIZES)[-2:]):
