@@ -27,7 +27,7 @@ help:
 	@echo "make test-all the slow tests too: kills, a million calls, several processes; half an hour on 2 cores"
 	@echo "make bench    DT and DTFM beside d3rlpy, training and acting: 15 minutes on 2 idle cores"
 	@echo "make baselines    DT and DTFM beside d3rlpy's and robomimic's algorithms on studies/baselines.yml: days on one core;"
-	@echo "              ARGUMENTS=\"--data can-few --seeds 0\" runs some of it, ARGUMENTS=--help says what there is"
+	@echo "              ARGUMENTS=\"--data can-10 --seeds 0\" runs some of it, ARGUMENTS=--help says what there is"
 	@echo "make ogbench  environment of studies/ogbench in $(OGBENCH), with this package and OGBench"
 	@echo "make lowest   tests of each part with the lowest versions that pyproject.toml allows; make highest: the highest"
 	@echo "make newest   tests of the package without robosuite on the newest Python here, with constraints-numpy2.txt: a minute"

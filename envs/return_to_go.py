@@ -242,7 +242,7 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def set_target_return(self, target_return: float) -> None:
         """
-        Ask for another return from the next reset on; also through ``VecEnv.env_method("set_target_return", value)``.
+        Set the target return from the next reset on; also through ``VecEnv.env_method("set_target_return", value)``.
 
         :param target_return: environment reward units
         :raises ValueError: not a finite number

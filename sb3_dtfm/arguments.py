@@ -8,7 +8,7 @@ import math
 import numbers
 import re
 import unicodedata
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -216,14 +216,20 @@ def with_nearest(names: Iterable[str], known: Iterable[str]) -> str:
     return ", ".join(name + (f" (did you mean {found[0]}?)" if found else "") for name, found in nearest.items())
 
 
-def documented_parameters(*described: type, order: Iterable[str] = ()) -> str:
+def documented_parameters(*described: type, order: Iterable[str] = (), decided: Container[str] = ()) -> str:
     """
-    The `:param` entries of classes' docstrings.
+    The `:param` entries of classes' docstrings, those of :class:`Options` with their defaults.
 
     :param described: the classes
     :param order: of parameters; others follow
+    :param decided: names of options that the data decide by default
     """
-    text = "\n".join(inspect.cleandoc(each.__doc__ or "") for each in described)
-    found = dict(re.findall(r"^:param (\w+):(.*?)(?=^:|\Z)", text, re.DOTALL | re.MULTILINE))
+    found: dict[str, str] = {}
+    for each in described:
+        defaults = each.defaults() if issubclass(each, Options) else {}
+        text = inspect.cleandoc(each.__doc__ or "")
+        for name, entry in re.findall(r"^:param (\w+):(.*?)(?=^:|\Z)", text, re.DOTALL | re.MULTILINE):
+            default = "decided from the data" if name in decided else repr(defaults.get(name))
+            found[name] = entry.rstrip() + (f" (default: {default})" if name in defaults else "")
     names = [*(name for name in order if name in found), *found]
-    return "\n".join(f":param {name}:{found[name].rstrip()}" for name in dict.fromkeys(names))
+    return "\n".join(f":param {name}:{found[name]}" for name in dict.fromkeys(names))

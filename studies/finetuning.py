@@ -91,7 +91,7 @@ def environment_steps(run: Path) -> np.ndarray:
 
 
 def curve(run: Path) -> list[dict[str, Any]]:
-    """Its evaluations; where there are two after as many steps, the one after the last turn's gradient steps."""
+    """Its evaluations; where there are two after as many steps, the one after the last round's gradient steps."""
     with np.load(run / "evaluations.npz") as saved:
         columns = {name: saved[name].tolist() for name in saved.files}
     successes = columns.get("successes", [None] * len(columns["timesteps"]))

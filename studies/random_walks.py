@@ -41,7 +41,7 @@ WALKED = [[START if cell == FREE else cell for cell in row] for row in MAZE]
 DATASET_ID = "local/pointmaze/random-walks-v0"
 N_STEPS = 50  # of a walk
 ENV_KWARGS = {"maze_map": MAZE, "continuing_task": False, "max_episode_steps": 300}  # of an evaluation
-CANDIDATES, N_REPEATS = (1, 8, 32), 5  # of `cost`
+N_SAMPLES, N_REPEATS = (1, 8, 32), 5  # of `cost`
 TURN = 0.15  # probability with which a walk takes another direction at a step
 
 
@@ -96,7 +96,7 @@ def cost(model: DTFM) -> None:
     """Print the milliseconds of an action by the number of samples that the critic chooses among, in turn."""
     wrapper = {"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 1.0}}
     env = make_seeded_envs(ENV_ID, {"env_wrapper": wrapper, "env_kwargs": ENV_KWARGS}, n_envs=1)
-    milliseconds: dict[int, list[float]] = {n: [] for n in CANDIDATES}
+    milliseconds: dict[int, list[float]] = {n: [] for n in N_SAMPLES}
     for seed in range(N_REPEATS):
         for n_action_samples, times in milliseconds.items():
             model.policy.set_acting(n_action_samples=n_action_samples)

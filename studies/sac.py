@@ -76,7 +76,7 @@ def main() -> None:
         recorded = load_dataset(of_the_data["dataset"], **of_the_data.get("dataset_kwargs", {}))
         print(f"{fill(agent.replay_buffer, recorded, agent)} recorded steps in the replay buffer")
     row = {
-        **{key: like[key] for key in ("task", "regime", "seed", "profile", "data")},
+        **{key: like[key] for key in ("task", "data_share", "seed", "profile", "data")},
         "algo": "sac",
         "label": "sac-with-data" if options.with_data else "sac",
         "settings": {"n_envs": N_ENVS, **SETTINGS, **of_the_task, **(of_the_data if options.with_data else {})},

@@ -73,13 +73,13 @@ PAPER = dict(WIDE, embed_dim=256, n_layers=10)
 # Sizes that papers and other libraries use. For a version before 581be92, with other option names, take f478840's steps.py.
 SIZES: dict[str, Step] = {
     "width 128 x 3, one step, batch 64": Step("dtfm", 17, 6, 64, 1, dict(SMALL, dropout=0.2)),
-    "the same, chunks of 8": Step("dtfm", 29, 7, 64, 1, dict(SMALL, dropout=0.0, chunk_size=8)),
-    "the same, five steps": Step("dtfm", 17, 6, 64, 5, dict(SMALL, dropout=0.0, film_return_to_go=True)),
-    "the same, one step, batch 256": Step("dtfm", 17, 6, 256, 1, dict(SMALL, dropout=0.2)),
+    "width 128 x 3, one step, chunks of 8": Step("dtfm", 29, 7, 64, 1, dict(SMALL, dropout=0.0, chunk_size=8)),
+    "width 128 x 3, five steps": Step("dtfm", 17, 6, 64, 5, dict(SMALL, dropout=0.0, film_return_to_go=True)),
+    "width 128 x 3, one step, batch 256": Step("dtfm", 17, 6, 256, 1, dict(SMALL, dropout=0.2)),
     "width 128 x 3, 20 steps, head 512": Step("dtfm", 17, 6, 64, 20, WIDE),
-    "the same, head 128": Step("dtfm", 17, 6, 64, 20, dict(WIDE, flow_hidden_dim=128)),
+    "width 128 x 3, 20 steps, head 128": Step("dtfm", 17, 6, 64, 20, dict(WIDE, flow_hidden_dim=128)),
     "width 256 x 10, 20 steps, head 512": Step("dtfm", 17, 6, 64, 20, PAPER),
-    "the same, three tokens a step": Step("dtfm", 17, 6, 64, 20, dict(PAPER, tokens_per_step=3)),
+    "width 256 x 10, 20 steps, three tokens a step": Step("dtfm", 17, 6, 64, 20, dict(PAPER, tokens_per_step=3)),
 }
 STEPS = {**DEFAULTS, **SIZES}
 COLUMNS = {

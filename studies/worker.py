@@ -1,7 +1,7 @@
 """
 Measure DT or DTFM; run by `compare.py`, each measurement in a process of its own.
 
-`python worker.py train MODEL N` or `python worker.py act MODEL N SOLVER SOLVER_STEPS KV_CACHE N_ENVS FIRST` prints one line
+`python worker.py train MODEL N` or `python worker.py act MODEL N FLOW_SOLVER FLOW_STEPS KV_CACHE N_ENVS FIRST` prints a line
 of JSON; MODEL is ALGO WIDTH LAYERS FLOW_HIDDEN_DIM TOKENS_PER_STEP. `python worker.py profile train MODEL N
 [PRECISION]` prints the share of the processor's time that each of torch's operations takes in as many steps of training, in
 float32 unless said otherwise, and `profile act ...` that of each function.

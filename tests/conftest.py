@@ -69,7 +69,7 @@ def same_random_numbers():
 
 
 def make_env(seed: int | None = None) -> gym.Env:
-    """HalfCheetah in episodes of 30 steps, asking for a return of 5."""
+    """HalfCheetah in episodes of 30 steps, with a target return of 5."""
     env = ReturnToGoWrapper(gym.make("HalfCheetah-v5", max_episode_steps=EPISODE_LENGTH), target_return=5.0)
     if seed is not None:
         env.reset(seed=seed)

@@ -335,8 +335,8 @@ class SequenceModel(BaseAlgorithm):
         model = cls(attributes["policy_class"], device=device, _init_setup_model=False)  # type: ignore[call-arg]
         if attributes.get("online_actor") is not None and not hasattr(model, "online_actor"):
             raise ModelFileError(
-                f"{source} is a fine-tuned DTFM: sb3_dtfm.finetuning.FinetunedDTFM loads it. To go on learning, `sb3-dtfm "
-                "finetune -i` takes the agent.zip beside it, and --model the DTFM that it began with."
+                f"{source} is a fine-tuned DTFM: sb3_dtfm.finetuning.FinetunedDTFM loads it. To fine-tune further, "
+                "`sb3-dtfm finetune -i` takes the agent.zip beside it, and --model the DTFM that it began with."
             )
         accepted = model._saved_names() | ENCODED | set(custom_objects)
         for name in attributes:

@@ -17,7 +17,7 @@ from sb3_dtfm.algorithms.options import TrainingOptions
 from sb3_dtfm.arguments import POSITIVE, documented_parameters, whole_timesteps
 from sb3_dtfm.callbacks import GradientStepProgressBar, TimeLeft, combine_callbacks
 from sb3_dtfm.data import Dataset, TrajectoryBuffer, check_controller, load_dataset, without_pickles
-from sb3_dtfm.data.decisions import Decision, decide_open, sentences
+from sb3_dtfm.data.decisions import DECIDED, Decision, decide_open, sentences
 from sb3_dtfm.data.inspection import return_reference, suggested_target_return
 from sb3_dtfm.distributed import (
     DataParallel,
@@ -51,7 +51,7 @@ from sb3_dtfm.windows import Windows
 SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineAlgorithm")
 
 # Arguments of the algorithm that the data decide where they are None; the policy's are among `policy_kwargs`.
-DECIDED = {"batch_size", "return_weighting"}
+DECIDED_HERE = DECIDED & set(TrainingOptions.defaults())
 # Episodes that a message shows at most.
 N_EPISODES_SHOWN = 50
 # Windows of which `train/best_of_n_share` is measured: with 32 samples of each, a whole batch took 9 % of the training time.
@@ -98,8 +98,8 @@ class OfflineAlgorithm(SequenceModel):
         policy: Any = cls.policy_aliases.get(POLICY_NAMES[0])
         if cls.__base__ is OfflineAlgorithm and policy is not None:
             order = inspect.signature(cls).parameters
-            own = documented_parameters(OfflineAlgorithm, TrainingOptions, order=order)
-            of_the_policy = documented_parameters(PolicyOptions, policy.head_class.options_class)
+            own = documented_parameters(OfflineAlgorithm, TrainingOptions, order=order, decided=DECIDED)
+            of_the_policy = documented_parameters(PolicyOptions, policy.head_class.options_class, decided=DECIDED)
             parts = [inspect.cleandoc(cls.__doc__ or ""), own, "`policy_kwargs` may hold:", of_the_policy]
             cls.__doc__ = "\n\n".join(parts)
 
@@ -156,10 +156,10 @@ class OfflineAlgorithm(SequenceModel):
     def _decide(self, buffer: TrajectoryBuffer) -> None:
         """Have the data decide of the arguments what the user has left open; they are saved with the others."""
         given = self.policy_kwargs or {}
-        names = self._policy_class.parameter_names() | {name for name in DECIDED if getattr(self, name) is None}
+        names = self._policy_class.parameter_names() | {name for name in DECIDED_HERE if getattr(self, name) is None}
         self.decisions = decide_open(buffer, names, given)
         values = {each.name: each.value for each in self.decisions}
-        for name in DECIDED & set(values):
+        for name in DECIDED_HERE & set(values):
             setattr(self, name, values.pop(name))
         self.policy_kwargs = {**values, **given}
 

@@ -20,12 +20,12 @@ class TrainingOptions(Options):
     """
     Options of the windows that are drawn, and of the gradient steps that learn from them.
 
-    :param batch_size: windows in a gradient step, of all processes together; by default 64 of less than 10,000 recorded
-        steps, and 256 of more
+    :param batch_size: windows in a gradient step, of all processes together; 64 of less than 10,000 recorded steps, and
+        256 of more
     :param context_length: K, steps the policy sees
     :param return_weighting: w: of mixed data, a step of the best episode is learned from 1 + w times as often as one of the
-        worst, and others by their returns in between (Yue et al., 2022); 0 learns from all alike. By default 5 where
-        returns tell how episodes act, and 0 elsewhere
+        worst, and others by their returns in between (Yue et al., 2022); 0 learns from all alike. 5 where returns tell how
+        episodes act, and 0 elsewhere
     :param weight_decay: AdamW's, on weight matrices only
     :param learning_rate_schedule: factor on the learning rate: "constant", or "linear" or "cosine" down to zero
     :param warmup_steps: gradient steps over which the learning rate rises linearly from zero; 0 for none

@@ -160,36 +160,36 @@ def plan(options: argparse.Namespace) -> tuple[list[Job], list[RunKey]]:
     jobs: list[Job] = []
     done: list[RunKey] = []
     # Seeds outermost: a grid that is cut short has seen every task.
-    for seed, task, regime in product(options.seeds, read_tasks(options), options.fractions):
-        for algo, wanted in _settings(task, regime, options).items():
+    for seed, task, data_share in product(options.seeds, read_tasks(options), options.fractions):
+        for algo, wanted in _settings(task, data_share, options).items():
             key, target = (
-                RunKey(task.name, regime, algo, seed, profile, options.label),
+                RunKey(task.name, data_share, algo, seed, profile, options.label),
                 find_target_return(wanted.get("env_wrapper")),
             )
             if (rows := Path(options.results) / f"{key.file_name}.jsonl") in files and key not in finished:
                 raise UsageError(f"{key}: {rows} is there, without a final evaluation of this run; move it away.")
-            if (key not in finished or target is None) and (task.name, regime) not in looked_at:
-                looked_at[task.name, regime] = _look_at(task, wanted)
+            if (key not in finished or target is None) and (task.name, data_share) not in looked_at:
+                looked_at[task.name, data_share] = _look_at(task, wanted)
             if target is None:
-                suggested = looked_at[task.name, regime][1]
+                suggested = looked_at[task.name, data_share][1]
                 wanted["env_wrapper"] = with_target_return(suggested, wanted.get("env_wrapper"))
             if key in finished:
                 _check_same(key, finished[key], wanted, options)
                 done.append(key)
                 continue
             eval_freq = options.eval_freq or max(1, int(wanted["n_timesteps"]) // N_EVALUATIONS)
-            jobs.append(Job(key, task, wanted, looked_at[task.name, regime][0], eval_freq))
+            jobs.append(Job(key, task, wanted, looked_at[task.name, data_share][0], eval_freq))
     return jobs, done
 
 
-def _settings(task: Task, regime: float, options: argparse.Namespace) -> dict[str, dict[str, Any]]:
+def _settings(task: Task, data_share: float, options: argparse.Namespace) -> dict[str, dict[str, Any]]:
     """
     Return settings by algorithm, for those asked for that can learn the task.
 
     :raises UsageError: settings that do not fit, or that differ by more than a head
     """
     own = {
-        algo: task_settings(options.profile, algo, task, regime, options.n_timesteps, options.hyperparams)
+        algo: task_settings(options.profile, algo, task, data_share, options.n_timesteps, options.hyperparams)
         for algo in ALGORITHMS
     }
     check_same_transformer(own, task.name)

@@ -77,7 +77,7 @@ COLUMNS = {
     "seed": Column("seed", int),
     "profile": Column("profile", str),
     "label": Column("label", str, True),
-    "data_share": Column("regime", _number),
+    "data_share": Column("data_share", _number),
     "gradient_step": Column("step", int),
     "final": Column("final", _flag),
     "episodes": Column("n_episodes", int),
@@ -190,8 +190,8 @@ def _read_line(cells: dict[str, str]) -> Result:
             result[key] = read(text)
         except (ValueError, KeyError) as error:
             raise RowError(f"{name} is {text!r}, expected {EXPECTED[read]}.") from error
-    if not 0.0 < result["regime"] <= 1.0:
-        raise RowError(f"data_share is {result['regime']!r}, expected a number in (0, 1].")
+    if not 0.0 < result["data_share"] <= 1.0:
+        raise RowError(f"data_share is {result['data_share']!r}, expected a number in (0, 1].")
     if not 0 <= (result["successes"] or 0) <= result["n_episodes"] or result["n_episodes"] < 1:
         raise RowError(f"holds {result['successes']} successes of {result['n_episodes']} episodes, expected 1 or more.")
     return result

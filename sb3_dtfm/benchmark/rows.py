@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, NoReturn
 # Key of a row: the types that its value may have.
 KEYS: dict[str, tuple[type, ...]] = {
     **dict.fromkeys(("task", "algo", "profile", "label"), (str,)),
-    **dict.fromkeys(("regime", "wall_s", "steps_per_s"), (float, int)),
+    **dict.fromkeys(("data_share", "wall_s", "steps_per_s"), (float, int)),
     **dict.fromkeys(("seed", "step"), (int,)),
     "final": (bool,),
     **dict.fromkeys(("returns", "lengths"), (list,)),
@@ -36,7 +36,7 @@ class RunKey(NamedTuple):
     Identity of a training run; rows with equal keys belong to one run.
 
     :param task: name of the task with its data, which is the Gymnasium id where nothing else was said
-    :param regime: share of its episodes, in (0, 1]
+    :param data_share: share of its episodes, in (0, 1]
     :param algo: "dt" or "dtfm", or one of `BASELINES`
     :param seed: of weights, batches and acting
     :param profile: name of the settings
@@ -44,7 +44,7 @@ class RunKey(NamedTuple):
     """
 
     task: str
-    regime: float
+    data_share: float
     algo: str
     seed: int
     profile: str
@@ -53,17 +53,17 @@ class RunKey(NamedTuple):
     @classmethod
     def of(cls, row: Row) -> "RunKey":
         """The key of the run that a row belongs to."""
-        return cls(row["task"], float(row["regime"]), row["algo"], row["seed"], row["profile"], row["label"])
+        return cls(row["task"], float(row["data_share"]), row["algo"], row["seed"], row["profile"], row["label"])
 
     @property
     def file_name(self) -> str:
         """Name for files and folders of this run: no separators, no spaces."""
-        parts = [self.task, f"{self.regime:g}", self.algo, f"seed{self.seed}", self.profile, self.label]
+        parts = [self.task, f"{self.data_share:g}", self.algo, f"seed{self.seed}", self.profile, self.label]
         return plain_name("_".join(part for part in parts if part))
 
     def __str__(self) -> str:
         label = f", {self.label}" if self.label else ""
-        return f"{self.task}, {self.regime:.0%} of the data, {self.algo}, seed {self.seed}, {self.profile}{label}"
+        return f"{self.task}, {self.data_share:.0%} of the data, {self.algo}, seed {self.seed}, {self.profile}{label}"
 
 
 def plain_name(text: str) -> str:
@@ -95,8 +95,8 @@ def check_row(row: Any) -> Row:
     if len({len(values) for values in episodes.values()}) != 1 or not row["returns"]:
         counts = ", ".join(f"{len(values)} {key}" for key, values in episodes.items())
         raise RowError(f"holds {counts}, expected one of each for every episode, and at least one episode.")
-    if not 0.0 < row["regime"] <= 1.0:
-        raise RowError(f"regime is {row['regime']!r}, expected a number in (0, 1].")
+    if not 0.0 < row["data_share"] <= 1.0:
+        raise RowError(f"data_share is {row['data_share']!r}, expected a number in (0, 1].")
     return row
 
 

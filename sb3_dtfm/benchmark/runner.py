@@ -174,7 +174,7 @@ class Runner:
         """Show how far the run is, and keep what else it prints, until it ends."""
         assert process.stdout is not None
         key = job.key
-        name = f"{key.task} {key.regime:.0%} {key.algo} seed {key.seed} {key.label}".strip()
+        name = f"{key.task} {key.data_share:.0%} {key.algo} seed {key.seed} {key.label}".strip()
         with log.open("w", buffering=1) as file, _bar(name, job.n_steps) as bar:
             for line in process.stdout:
                 found = PROGRESS.fullmatch(line)

@@ -92,7 +92,7 @@ def read_profile(profile: str, algo: str, env_id: str) -> dict[str, Any]:
 
 
 def task_settings(
-    profile: str, algo: str, task: Task, regime: float, n_timesteps: int | None, hyperparams: dict[str, Any]
+    profile: str, algo: str, task: Task, data_share: float, n_timesteps: int | None, hyperparams: dict[str, Any]
 ) -> dict[str, Any]:
     """
     Everything that RL-Zoo's `train` is to read for one run, but the seed.
@@ -102,7 +102,7 @@ def task_settings(
     :param profile: see :func:`read_profile`
     :param algo: for example "dtfm"
     :param task: the task and its data
-    :param regime: share of the episodes
+    :param data_share: share of the episodes
     :param n_timesteps: gradient steps, None for the profile's
     :param hyperparams: replace the profile's; mappings of keyword arguments replace entry by entry, and options of the
         policy may stand beside the others
@@ -132,7 +132,7 @@ def task_settings(
     missing = [option for key, option in needed.items() if key not in settings]
     if missing:
         raise UsageError(f"{', '.join(missing)}: needed for {task.name}, which --profile {profile} does not list.")
-    settings["dataset_kwargs"] = {**dataset_kwargs, "fraction": task.fraction * regime, "fraction_seed": 0}
+    settings["dataset_kwargs"] = {**dataset_kwargs, "fraction": task.fraction * data_share, "fraction_seed": 0}
     try:
         yaml.safe_dump(settings)
     except yaml.YAMLError as error:
@@ -167,7 +167,7 @@ def check_same_transformer(settings: dict[str, dict[str, Any]], task: str) -> No
         values = {algo: each.get(key) for algo, each in flat.items()}
         if any(value != next(iter(values.values())) for value in values.values()):
             found = " and ".join(f"{value!r} for {algo}" for algo, value in values.items())
-            raise UsageError(f"{key} of {task} is {found}; all need the same.")
+            raise UsageError(f"{key} of {task} is {found}; one value for all is needed.")
 
 
 def _mapping(settings: dict[str, Any], key: str) -> dict[str, Any]:

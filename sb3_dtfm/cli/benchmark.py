@@ -64,7 +64,7 @@ def benchmark_parser() -> argparse.ArgumentParser:
     grid("--label", default="", help="name of what -params change; part of a run's identity")
     data = parser.add_argument_group("data").add_argument
     data("--dataset", **several, metavar="TASK=DATASET", help="Minari id, robomimic file or flat arrays")
-    data("--datasets", metavar="FILE", help="YAML file that says the same for many tasks, see below")
+    data("--datasets", metavar="FILE", help="YAML file with entries for many tasks, see below")
     data("--dataset-cache", metavar="DIR", help="learn from memory-mapped files made in this folder")
     data("--target-return", **several, metavar="[TASK=]RETURN", help="when acting, in reward units")
     training = parser.add_argument_group("training and evaluation").add_argument

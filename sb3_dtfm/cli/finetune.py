@@ -1,4 +1,4 @@
-"""`sb3-dtfm finetune`: go on learning online, from a trained DTFM."""
+"""`sb3-dtfm finetune`: fine-tune a trained DTFM online."""
 
 import argparse
 from collections.abc import Sequence
@@ -76,7 +76,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="sb3-dtfm finetune",
         add_help=False,
         usage="sb3-dtfm finetune --model MODEL --env ENV [options] [RL-Zoo options]",
-        description="Go on learning online: a DTFM from its own episodes (--algo dtfm), or an SB3 algorithm "
+        description="Fine-tune a trained model online: a DTFM from its own episodes (--algo dtfm), or an SB3 algorithm "
         "that chooses the noise of a frozen one, or adds residual actions to its own.",
         epilog=f"examples:\n{EXAMPLES}\nRL-Zoo's own options follow.\n",
         formatter_class=argparse.RawDescriptionHelpFormatter,

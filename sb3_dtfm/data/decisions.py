@@ -27,6 +27,12 @@ NOISY = -0.3
 # Recorded steps for each dimension of the observation below which there is dropout, and how much of it.
 FEW_STEPS_PER_DIMENSION, DROPOUT = 250, 0.2
 
+# Settings that the data decide where the user gives none.
+DECIDED = frozenset(
+    ("batch_size", "flow_draws", "dropout", "return_conditioning", "return_weighting", "expected_return_steps", "return_range",
+     "chunk_size", "flow_steps", "regression_coef", "timestep_embedding", "observation_scaling")
+)  # fmt: skip
+
 
 class Decision(NamedTuple):
     """

@@ -1,4 +1,4 @@
-"""Go on learning online: a DTFM from its own episodes, or an algorithm of Stable-Baselines3 by choosing how it acts."""
+"""Online fine-tuning: a DTFM from its own episodes, or an algorithm of Stable-Baselines3 by choosing how it acts."""
 
 from sb3_dtfm.finetuning.finetuned import FINETUNED, FinetunedDTFM
 from sb3_dtfm.finetuning.noise_env import NoiseActionVecEnv, NoiseSpace

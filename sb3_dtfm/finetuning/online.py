@@ -1,4 +1,4 @@
-"""A DTFM that goes on learning from episodes of its own."""
+"""Fine-tuning of a DTFM by rounds of filtered imitation."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -63,7 +63,7 @@ class Step(NamedTuple):
 
 class OnlineDTFM(DTFM):
     """
-    A DTFM that goes on imitating: its dataset, and those of its own episodes that succeeded.
+    A DTFM that is fine-tuned by filtered imitation: of its dataset, and of its own episodes that succeeded.
 
     It acts from fresh noise, so that no two rollouts are alike; successes are imitated, and become more frequent.
     If the environment tells of no success, an episode is imitated that returned at least as much as the average of
@@ -73,8 +73,8 @@ class OnlineDTFM(DTFM):
     `learn(total_timesteps)` counts the environments' steps, as online algorithms do. The model stays a DTFM and is saved as
     one: `OnlineDTFM.load("can.zip", env, dataset="can.hdf5")` goes on from a DTFM, and `DTFM.load` reads what it saves.
 
-    :param n_episodes: own episodes between two times of learning, of all environments together
-    :param gradient_steps: each of these times, over which `learning_rate_schedule` and `warmup_steps` go
+    :param n_episodes: own episodes of a round, of all environments together
+    :param gradient_steps: of a round, over which `learning_rate_schedule` and `warmup_steps` go
     :ivar replay_buffer: all own episodes, None before the first ones
     """
 
@@ -129,7 +129,7 @@ class OnlineDTFM(DTFM):
 
         :param total_timesteps: steps of all environments together
         :param callback: SB3 callback or list of callbacks
-        :param log_interval: times of learning between two logs, None for none
+        :param log_interval: rounds between two logs, None for none
         :param tb_log_name: name of the run in TensorBoard, the algorithm's by default
         :param reset_num_timesteps: count from zero, otherwise go on counting
         :param progress_bar: show one

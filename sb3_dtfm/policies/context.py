@@ -204,7 +204,8 @@ def check_chunks(context: Context, due: np.ndarray, chunks: np.ndarray) -> None:
     cause = (
         f"state holds NaN or infinity in {', '.join(names)}. Begin these rows anew with episode_start."
         if names
-        else f"the policy's weights give none for a return_to_go of {largest:g}. Ask for less, or load other weights."
+        else f"the policy's weights give none for a return_to_go of {largest:g}. Take a smaller target, or load other "
+        "weights."
     )
     raise ValueError(f"There is no finite action in row {', '.join(map(str, rows))}: {cause}")
 

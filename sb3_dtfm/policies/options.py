@@ -61,11 +61,11 @@ class PolicyOptions(Options):
     :param return_conditioning: learn and act by the return-to-go; without it, the policy clones what was recorded
     :param expected_return_steps: n: a step's return-to-go is the rewards of n steps and the return expected after such an
         observation, so that a high target return does not stand for chance (Paster et al., 2022); 0 takes the recorded
-        one. By default 50 where returns tell how episodes act and no number makes up half of the rewards, and 0 elsewhere
+        one. 50 where returns tell how episodes act and no number makes up half of the rewards, and 0 elsewhere
     :param return_range: with `clip_return_to_go`, keep the return-to-go also within what may be expected from such an
         observation, see :class:`~sb3_dtfm.policies.network.ReturnRange`
-    :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step. Asking for more than
-        any episode reached, or falling behind, then stays an input like those the policy learned from
+    :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step. A target return
+        above any episode's, or falling behind, then stays an input like those the policy learned from
     :param return_scaling: "timestep" or "max", see :class:`~sb3_dtfm.policies.normalization.Normalization`
     :param film_return_to_go: let the return-to-go scale and shift the input of each Transformer block, besides being a token
     :param observation_scaling: "std" divides observations by their standard deviation, "robust" by the lower quartile of
@@ -88,8 +88,8 @@ class PolicyOptions(Options):
         no critic. 8 where there is a critic, if not given
     :param sample_noise_std: standard deviation of the noise that all but the first of them start from; above 1, which the
         flow has learned, they differ more, and the critic has more to choose among
-    :param temperature: how much chance that choice leaves, in units of how far actions' values spread in the data; 0, the
-        default, takes the one that both values of the critic find better than the first, by the larger gain
+    :param temperature: how much chance that choice leaves, in units of how far actions' values spread in the data; 0
+        takes the one that both values of the critic find better than the first, by the larger gain
     :param kv_cache: act on the keys and values kept of earlier steps instead of recomputing the window: two to three times
         faster, and equal until the window slides (see :func:`~sb3_dtfm.networks.cache.extend`)
     :raises ValueError: an option out of range, by name

@@ -54,7 +54,7 @@ class RecordingSummary(NamedTuple):
     def __str__(self) -> str:
         return (
             f"{self.n_episodes} demonstrations in {self.path}: {100 * self.success_rate:.0f} % of {self.n_attempts} "
-            f"attempts succeeded, mean length {self.mean_length:.0f} steps, {self.seconds:.0f} s"
+            f"episodes succeeded, mean length {self.mean_length:.0f} steps, {self.seconds:.0f} s"
         )
 
 
@@ -91,7 +91,7 @@ def record_demonstrations(
     :param cameras: whose images are recorded beside the numbers, see :class:`~sb3_dtfm.envs.robosuite.RobosuiteEnv`
     :param camera_size: height and width of these images, pixels
     :raises FileExistsError: `output` exists and is not to be overwritten
-    :raises ValueError: unknown task, numbers out of range, or fewer than one attempt in 5 succeeds
+    :raises ValueError: unknown task, numbers out of range, or fewer than one episode in 5 succeeds
     """
     if task not in demonstrated_tasks():
         raise ValueError(f"task must be one of {', '.join(map(repr, demonstrated_tasks()))}, got {task!r}.")

@@ -122,7 +122,7 @@ class StoreValues(argparse.Action):
 
 
 class StoreLiterals(argparse.Action):
-    """The same of arguments that others may have written: nothing is evaluated, and classes are known ones."""
+    """Keys and values that others may have written: nothing is evaluated, and classes are known ones."""
 
     def __call__(self, _: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
         given, where = key_values(f"{START}: {option}", values, literal), f"{START}: {option}"
@@ -160,7 +160,7 @@ class Restored(NamedTuple):
         """
         :param path: of settings that the run's folder names
         :param settings: what they say, None before they are read
-        :return: the same with literals, if they did not come with this package and the user does not name them
+        :return: these settings with literals, if they did not come with this package and the user does not name them
         :raises UsageError: such settings would run code
         """
         if path == self.conf_file or is_packaged(path):

@@ -2,7 +2,7 @@
 DT, DTFM and their baselines, trained and evaluated on the same data and initial states, one core each: `make baselines`.
 
     make baselines                                                          # everything of studies/baselines.yml
-    make baselines ARGUMENTS="--data can-few --algo dt dtfm bc --seeds 0"    # some of it
+    make baselines ARGUMENTS="--data can-10 --algo dt dtfm bc --seeds 0"    # some of it
     python studies/summary.py mine                                      # the rows as a table
 
 A run that is finished in the results folder is not started again; a kill loses at most the running one (ours continues from

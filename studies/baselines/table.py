@@ -22,7 +22,7 @@ from sb3_dtfm.benchmark.report.statistics import student_t
 NONE = "-"
 Grouped = dict[tuple[str, str], list[Run]]  # by dataset and algorithm
 # Names in studies/suite.yml of datasets that have another one in studies/baselines.yml.
-IN_SUITE = {"can-few": "can-10", "walker2d-clean": "walker2d-expert", "pusht-human": "pusht"}
+IN_SUITE = {"walker2d-clean": "walker2d-expert", "pusht-human": "pusht"}
 
 
 def read(folder: Path) -> tuple[Grouped, list[str], list[str]]:
@@ -83,12 +83,7 @@ def compared(folder: Path, suite: Path) -> tuple[Grouped, list[str], list[str]]:
     for group in (group for study in read_studies([suite]) for group in study.groups):
         for (task, _, algo), runs in group.runs.items():
             defaults.setdefault((task, algo), []).extend(runs)
-    tasks = {name: data.task for name, data in read_entries(STUDIES / "baselines.yml", Data).items()}
-    found: Grouped = {}
-    for (name, algo), runs in grouped.items():
-        same = [run for run in runs if run.key.task == tasks[name]]  # not of the task with another reward
-        if same and algo in others:
-            found[name, algo] = same
+    found: Grouped = {(name, algo): runs for (name, algo), runs in grouped.items() if algo in others}
     for name, algo in itertools.product(datasets, ALGORITHMS):
         if runs := defaults.get((IN_SUITE.get(name, name), algo)):
             found[name, algo] = runs

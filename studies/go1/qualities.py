@@ -1,6 +1,6 @@
 """
 Does return-to-go choose how fast a robot walks? Three teachers, who are told a third, two thirds and all of the command, lie
-in one dataset; a student learns from it and is asked for the return of each.
+in one dataset; a student learns from it and acts with the return of each as its target.
 
     R="sb3-dtfm record --algo onnx --model go1_policy.onnx --env Go1Velocity-v0 --gym-packages go1.teachers --episodes 150"
     PYTHONPATH=studies $R --seed 11 --env-wrapper go1.teachers.Gentle --dataset-id go1/gentle-v0

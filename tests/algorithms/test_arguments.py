@@ -248,6 +248,11 @@ def test_help_lists_every_parameter_those_of_policy_and_head_too(algorithm):
     constructor = set(inspect.signature(algorithm).parameters)
     options = algorithm.policy_aliases["MultiInputPolicy"].parameter_names()
     assert sorted(listed) == sorted([*constructor, *options])
+    entries = re.split(r"^:param ", inspect.getdoc(algorithm), flags=re.MULTILINE)
+    defaults = {
+        entry.partition(":")[0] for entry in entries if re.search(r"\(default: .+\)\s*$", entry.partition("\n\n")[0])
+    }
+    assert defaults == {*TrainingOptions.defaults(), *options}
 
 
 def test_the_constructor_takes_each_option_of_training_with_its_default(cheetah_buffer):

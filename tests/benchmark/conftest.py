@@ -11,7 +11,7 @@ def make_row(**changes: Any) -> Row:
     """A row of a final evaluation of four episodes."""
     row: Row = {
         "task": "robosuite/Lift-v0",
-        "regime": 1.0,
+        "data_share": 1.0,
         "algo": "dtfm",
         "seed": 0,
         "profile": "small",

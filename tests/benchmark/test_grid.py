@@ -36,7 +36,7 @@ PATIENCE = 120  # seconds to wait for a run
 
 @pytest.fixture
 def grid(workplace) -> list[str]:
-    """Arguments of a grid of 2 regimes and 2 algorithms, episodes of 10 steps."""
+    """Arguments of a grid of 2 data_shares and 2 algorithms, episodes of 10 steps."""
     (workplace / "tiny.yml").write_text(yaml.safe_dump({"default": SETTINGS}))
     arguments = ["benchmark", "--profile", "tiny.yml", "--dataset", f"{TASK}={DATASET_ID}", "--target-return", "50"]
     arguments += ["--eval-freq", "2", "--eval-episodes", "2", "--final-episodes", "3", "--n-eval-envs", "2"]
@@ -105,7 +105,7 @@ def test_a_killed_grid_takes_its_run_along_goes_on_and_repeats_nothing(grid, wor
         assert {row["data"]["n_episodes"] for row in each} == {3}
         assert each[0]["data"]["recorded_from"].startswith("PPO: ")
         assert each[0]["settings"]["env_kwargs"] == {"max_episode_steps": 10}
-        assert (each[0]["regime"], each[0]["hardware"]["threads"]) == (0.5, 1)
+        assert (each[0]["data_share"], each[0]["hardware"]["threads"]) == (0.5, 1)
     assert [(each[0]["flow_solver"], each[0]["flow_steps"]) for each in (rows["dt"], rows["dtfm"])] == [
         (None, None),
         ("euler", 2),
@@ -295,9 +295,9 @@ def suite(workplace) -> list[str]:
 
 def test_several_data_sets_of_a_task_are_told_apart_by_their_names(suite):
     jobs, _ = plan(parse_arguments(suite))
-    found = [(job.key.task, job.key.regime, job.key.algo) for job in jobs]
-    whole = [("whole", regime, algo) for regime in (1.0, 0.5) for algo in ("bc", "bc-best", "dt", "dtfm")]
-    assert found == [*whole, *(("some", regime, algo) for regime in (1.0, 0.5) for algo in ("bc", "dt"))]
+    found = [(job.key.task, job.key.data_share, job.key.algo) for job in jobs]
+    whole = [("whole", data_share, algo) for data_share in (1.0, 0.5) for algo in ("bc", "bc-best", "dt", "dtfm")]
+    assert found == [*whole, *(("some", data_share, algo) for data_share in (1.0, 0.5) for algo in ("bc", "dt"))]
     assert {job.row["env_id"] for job in jobs} == {TASK}
     assert [job.data.get("chosen_with", False) for job in jobs] == [True] * 8 + [False] * 4
     some = [job for job in jobs if job.key.task == "some"]
@@ -328,8 +328,8 @@ def test_the_data_suggest_a_return_to_ask_for_where_nobody_names_one(suite, work
     )
     jobs, _ = plan(parse_arguments([*suite, "--env", "whole", "--fractions", "1", "0.4"]))
     buffer = load_dataset(DATASET_ID, max_episode_steps=10)
-    targets = {job.key.regime: find_target_return(job.settings["env_wrapper"]) for job in jobs}
-    shares = {regime: suggested_target_return(buffer.random_fraction(regime, 0)) for regime in (1.0, 0.4)}
+    targets = {job.key.data_share: find_target_return(job.settings["env_wrapper"]) for job in jobs}
+    shares = {data_share: suggested_target_return(buffer.random_fraction(data_share, 0)) for data_share in (1.0, 0.4)}
     assert targets == shares
     assert jobs[0].data["best_return"] == pytest.approx(buffer.episode_returns.max(), abs=1e-3)
 
@@ -379,8 +379,8 @@ def test_a_mistake_in_an_entry_is_told_with_its_file_its_name_and_its_key(entry,
 def test_the_first_seed_of_everything_comes_first(grid, monkeypatch):
     options = parse_arguments([*grid[1:], "--seeds", "0", "1"])
     jobs, done = plan(options)
-    assert [(job.key.seed, job.key.regime, job.key.algo) for job in jobs] == [
-        (seed, regime, algo) for seed in (0, 1) for regime in (1.0, 0.5) for algo in ("dt", "dtfm")
+    assert [(job.key.seed, job.key.data_share, job.key.algo) for job in jobs] == [
+        (seed, data_share, algo) for seed in (0, 1) for data_share in (1.0, 0.5) for algo in ("dt", "dtfm")
     ]
     assert {json.dumps(job.data) for job in jobs} == {json.dumps(jobs[0].data)}
     assert done == []

@@ -374,7 +374,7 @@ def test_a_label_alone_is_a_group_of_its_own(tmp_path):
 
 def test_a_label_of_both_algorithms_is_a_comparison_of_its_own(tmp_path):
     rows = (ROWS / "lift.jsonl").read_text()
-    few = rows.replace('"label": ""', '"label": "few"').replace('"regime": 1.0', '"regime": 0.1')
+    few = rows.replace('"label": ""', '"label": "few"').replace('"data_share": 1.0', '"data_share": 0.1')
     assert rows != few
     (tmp_path / "rows.jsonl").write_text(rows + few)
     assert main(["report", str(tmp_path / "rows.jsonl"), "-o", str(tmp_path)]) == 0

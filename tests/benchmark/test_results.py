@@ -33,7 +33,9 @@ def test_a_table_holds_what_was_written(tmp_path):
         make_row(final=False, wall_s=123456.789),
         make_row(seed=1, successes=[False] * 4, action_ms=1.5, task="lift-10", env_id="robosuite/Lift-v0", commit=None),
         make_row(algo="dt", successes=None, flow_solver=None, flow_steps=None, returns=[1 / 3] * 4, label='a "b", c\nd'),
-        make_row(seed=2, regime=0.05, settings={"policy_kwargs": {"dropout": 0.1}}, versions={"its torch": "2.13.0+cpu"}),
+        make_row(
+            seed=2, data_share=0.05, settings={"policy_kwargs": {"dropout": 0.1}}, versions={"its torch": "2.13.0+cpu"}
+        ),
     ]
     results = [summarize(row) for row in rows]
     write_results(tmp_path / "a.csv", reversed(results))

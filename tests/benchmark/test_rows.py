@@ -32,7 +32,7 @@ def test_what_a_kill_has_left_of_a_last_line_is_left_out_where_that_is_known(tmp
         ({"step": "10"}, "step is '10', expected int"),
         ({"step": True}, "step is True, expected int"),
         ({"final": 1}, "final is 1, expected bool"),
-        ({"regime": 1.5}, "regime is 1.5, expected a number in"),
+        ({"data_share": 1.5}, "data_share is 1.5, expected a number in"),
         ({"lengths": [1]}, "4 returns, 1 lengths, 4 successes"),
         ({"returns": [], "lengths": [], "successes": []}, "0 returns"),
         ({"returns": [1.0, "x", 1.0, 1.0]}, "returns holds 'x'"),

@@ -204,7 +204,7 @@ def test_a_dtfm_goes_on_from_its_own_episodes(run, workplace, capsys):
         assert main([*command, "--eval-freq", "40", "--eval-episodes", "2"]) == 0
         online = workplace / f"logs/dtfm/HalfCheetah-v5_{number}"
         evaluations = np.load(online / "evaluations.npz")
-        assert evaluations["timesteps"].tolist() == [0, 40, 80, 80], "before and after the gradient steps of the last turn"
+        assert evaluations["timesteps"].tolist() == [0, 40, 80, 80], "before and after the gradient steps of the last round"
         assert evaluations["ep_lengths"].max() == 20, "of the run's own environment"
         own = load_dataset(online / "episodes.npz")
         assert own.episode_lengths.tolist() == [20] * (n_before + 4)

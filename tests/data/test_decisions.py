@@ -7,7 +7,7 @@ from gymnasium import spaces
 
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
-from sb3_dtfm.data.decisions import decide, sentences
+from sb3_dtfm.data.decisions import DECIDED, decide, sentences
 from sb3_dtfm.data.predictability import correlation_of_changes, prediction_errors
 
 SPACE = spaces.Box(-1.0, 1.0, (2,))
@@ -52,7 +52,7 @@ def test_a_planners_actions_are_drawn_in_chunks():
     assert decided["observation_scaling"] == "std"
 
 
-def test_a_planners_noise_takes_robust_units():
+def test_a_planners_noise_takes_robust_scaling():
     buffer = make_buffer("planner")
     buffer.stored["actions"] += 0.1 * th.randn(buffer.actions.shape, generator=th.Generator().manual_seed(0))
     decided = settings(buffer)
@@ -167,6 +167,7 @@ def test_images_are_learned_in_small_batches_by_several_draws_each():
     small = {"features_extractor_kwargs": {"features_dim": 8}}
     model = DTFM("MultiInputPolicy", dataset=episodes, policy_kwargs=small)
     assert (model.batch_size, model.policy.network.head.options.flow_draws) == (64, 8)
+    assert {each.name for each in [*model.decisions, *decide(make_buffer("several agents"))]} == DECIDED
     assert any("camera" in sentence and "flow_draws=8" in sentence for sentence in sentences(model.decisions))
     assert DTFM("MultiInputPolicy", dataset=episodes, batch_size=4, policy_kwargs=small).batch_size == 4
     assert "flow_draws" not in {

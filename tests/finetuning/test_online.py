@@ -1,4 +1,4 @@
-"""A DTFM that goes on learning from episodes of its own."""
+"""Fine-tuning of a DTFM by rounds of filtered imitation."""
 
 import numpy as np
 import pytest
@@ -272,13 +272,13 @@ def test_kept_keys_and_values_are_those_of_the_present_weights(cheetah_buffer, t
     model.policy.predict = lambda observation, state, *args: (seen.append(state), predict(observation, state, *args))[1]
     model.learn(40)
     sizes = [0 if state is None else Context(*state).keys_values.shape[1] for state in seen]
-    turns = [i for i, size in enumerate(sizes) if size == 0]
-    assert turns[0] == 0
-    assert len(turns) > 1
+    begins = [i for i, size in enumerate(sizes) if size == 0]
+    assert begins[0] == 0
+    assert len(begins) > 1
 
 
 def test_own_episodes_on_another_device_are_joined(cheetah_buffer):
-    """As a GPU's buffer is in the second turn; "meta" is a device that every machine has."""
+    """As a GPU's buffer is in the second round; "meta" is a device that every machine has."""
     joined = TrajectoryBuffer.join([cheetah_buffer.to("meta"), cheetah_buffer], [1.0, 1.0])
     assert joined.observations.device.type == "meta"
     assert joined.n_episodes == 2 * cheetah_buffer.n_episodes

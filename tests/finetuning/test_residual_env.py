@@ -16,8 +16,8 @@ ON_POLICY = dict(n_steps=4)
 QUICK = {SAC: OFF_POLICY, PPO: dict(**ON_POLICY, batch_size=4, n_epochs=1), A2C: ON_POLICY}
 
 
-UNITS = {"return_scaling": "timestep", "observation_scaling": "robust"}
-CASES = {"single": UNITS, "plans": {**CHUNKS, "n_action_steps": 1}, "cached": {"kv_cache": True}}
+SCALING = {"return_scaling": "timestep", "observation_scaling": "robust"}
+CASES = {"single": SCALING, "plans": {**CHUNKS, "n_action_steps": 1}, "cached": {"kv_cache": True}}
 
 
 @pytest.fixture(scope="module", params=list(CASES.values()), ids=list(CASES))

@@ -27,7 +27,11 @@ def make_windows(observations: list[float], returns_to_go: float, timestep: int)
 @pytest.mark.parametrize(
     ("observations", "expected"),
     [([2.0, 5.0], [2.0, 0.0]), ([-1.0, 6.0], [-4.0, 0.0]), ([100.0, 500.0], [40.0, 0.0])],
-    ids=["a unit is what a calm episode spreads", "a constant stays zero", "clipped at ten standard deviations"],
+    ids=[
+        "a unit is what an episode that moves little spreads",
+        "a constant stays zero",
+        "clipped at ten standard deviations",
+    ],
 )
 def test_observations_by_hand(observations, expected):
     normalized = make_normalization()(make_windows(observations, 0.0, 0))

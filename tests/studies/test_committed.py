@@ -23,7 +23,7 @@ IN_README = {
     "Swimmer, one agent": "swimmer",
     "Robosuite Stack, 50 scripted demonstrations": "stack-50",
     "Robosuite Can, half of 100 dropped *": "can-dropped*",
-    "Adroit door, people *": "door-human*",
+    "Adroit door, human demonstrations *": "door-human*",
 }
 # README's names of algorithms that learn from the same data.
 BASELINES = {

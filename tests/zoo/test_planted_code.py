@@ -147,7 +147,7 @@ def planted(trained, tmp_path, monkeypatch, minari_folder) -> Path:
 
 
 def yaml_for(command: str) -> list[str]:
-    """What is planted in the YAML files of a command's run: a part for `video`, which looks for a renderer each time."""
+    """Names of the texts that are planted in a command's run: a part for `video`, which looks for a renderer each time."""
     return list(OF_YAML)[:: 4 if command == "video" else 1]
 
 

@@ -100,7 +100,7 @@ class Demonstrator:
         hand = observation[:3]
         fingers = float(observation[7] - observation[8]) / 2.0
         finger_speed, self._fingers = abs(fingers - self._fingers), fingers
-        position = self._look(observation)
+        position = self._locate(observation)
         turn = rotation_between(observation[3:7], self._orientation)
         self._to_turn = float(np.linalg.norm(turn))
         stage = self._next_stage(hand, position, fingers, finger_speed)
@@ -109,7 +109,7 @@ class Demonstrator:
         target, gripper = self._target(hand, position)
         return self._move(target - hand, turn, gripper)
 
-    def _look(self, observation: np.ndarray) -> np.ndarray:
+    def _locate(self, observation: np.ndarray) -> np.ndarray:
         """
         Return where to grasp or hold the object, (3,) metres; the hand's orientation is chosen here too, where it matters.
 

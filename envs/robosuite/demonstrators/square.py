@@ -28,7 +28,7 @@ class SquareDemonstrator(PlacingDemonstrator):
         super().reset()
         self._drop_height = self._rng.uniform(0.87, 0.93)  # metres
 
-    def _look(self, observation: np.ndarray) -> np.ndarray:
+    def _locate(self, observation: np.ndarray) -> np.ndarray:
         turned = object_yaw(observation[19:23])
         self._handle = HANDLE * np.array([np.cos(turned), np.sin(turned)])
         if self.stage in ("hover", "descend", "pause", "grasp"):

@@ -21,7 +21,7 @@ class StackDemonstrator(PlacingDemonstrator):
         super().reset()
         self._drop = self._rng.uniform(0.0, 0.006)  # metres
 
-    def _look(self, observation: np.ndarray) -> np.ndarray:
+    def _locate(self, observation: np.ndarray) -> np.ndarray:
         cube, self._large_cube = observation[9:12], observation[16:19]
         if self.stage == "hover":
             aside = self._large_cube - cube

@@ -110,8 +110,8 @@ def plot_group(
     with _figure(group, group.tasks, output, X_AXES[x][0]) as axes:
         for task, row in zip(group.tasks, axes, strict=True):
             own = [baseline for baseline in baselines if baseline.task in (None, task)]
-            for regime, axis in zip(group.regimes, row, strict=True):
-                _draw_panel(axis, group, task, regime, x, own, agent_line)
+            for data_share, axis in zip(group.data_shares, row, strict=True):
+                _draw_panel(axis, group, task, data_share, x, own, agent_line)
             runs = group.of_task(task)
             if runs and runs[0].counts_success:
                 row[0].set(ylabel="success rate (%)", ylim=(-3, 103))
@@ -135,9 +135,9 @@ def plot_solved(group: Group, output: Path) -> Path | None:
         return None
     with _figure(group, tasks, output, "environment steps") as axes:
         for task, row in zip(tasks, axes, strict=True):
-            for regime, axis in zip(group.regimes, row, strict=True):
+            for data_share, axis in zip(group.data_shares, row, strict=True):
                 for algo, (color, _) in zip(group.algorithms, cycle(STYLES), strict=False):
-                    if runs := group.of(task, regime, algo):
+                    if runs := group.of(task, data_share, algo):
                         steps = steps_to_success(runs)
                         share = 100.0 * np.arange(1, len(steps) + 1) / len(steps)
                         solved = np.isfinite(steps)
@@ -166,9 +166,9 @@ def plot_scores(group: Group, output: Path) -> Path | None:
     styles = {**dict(zip((algo for algo in algos if algo not in SCORE_STYLES), cycle(OTHER_STYLES))), **SCORE_STYLES}
     drawn = [
         (row, algo, interval)
-        for row, (_, task, regime) in enumerate(data_sets)
+        for row, (_, task, data_share) in enumerate(data_sets)
         for algo in algos
-        if (runs := group.of(task, regime, algo)) and (interval := score_interval(runs)) is not None
+        if (runs := group.of(task, data_share, algo)) and (interval := score_interval(runs)) is not None
     ]
     if not drawn:
         return None
@@ -206,14 +206,14 @@ def _figure(group: Group, tasks: Sequence[str], output: Path, x_label: str) -> I
     from matplotlib.figure import Figure
 
     with mpl.rc_context({"font.size": 11, "axes.spines.top": False, "axes.spines.right": False, "axes.axisbelow": True}):
-        shape = len(tasks), len(group.regimes)
+        shape = len(tasks), len(group.data_shares)
         width = max(PANEL[0] * shape[1], 6.0)  # of the legend
         figure = Figure(figsize=(width, PANEL[1] * shape[0] + 0.5), layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.subplots(*shape, squeeze=False, sharey="row")
         for task, row in zip(tasks, axes, strict=True):
-            for regime, axis in zip(group.regimes, row, strict=True):
-                axis.set_title(f"{task}, {_share(regime)}", fontsize=11)
+            for data_share, axis in zip(group.data_shares, row, strict=True):
+                axis.set_title(f"{task}, {_share(data_share)}", fontsize=11)
                 axis.grid(color="0.9")
         for axis in axes[-1]:
             axis.set_xlabel(x_label)
@@ -230,16 +230,16 @@ def _save(figure: "Figure", axes: Iterable["Axes"], output: Path, **legend: Any)
     figure.savefig(output, dpi=150)
 
 
-def _share(regime: float) -> str:
-    return {1.0: "full data", 0.5: "half of the data"}.get(regime, f"{regime:.0%} of the data")
+def _share(data_share: float) -> str:
+    return {1.0: "full data", 0.5: "half of the data"}.get(data_share, f"{data_share:.0%} of the data")
 
 
 def _draw_panel(
-    axis: "Axes", group: Group, task: str, regime: float, x: str, baselines: Sequence[Baseline], agent_line: bool
+    axis: "Axes", group: Group, task: str, data_share: float, x: str, baselines: Sequence[Baseline], agent_line: bool
 ) -> None:
     from matplotlib.ticker import EngFormatter, MaxNLocator
 
-    drawn = {algo: runs for algo in group.algorithms if (runs := group.of(task, regime, algo))}
+    drawn = {algo: runs for algo in group.algorithms if (runs := group.of(task, data_share, algo))}
     missing = [algo.upper() for algo in group.algorithms if algo not in drawn]
     if missing:
         text = f"{', '.join(missing)}: not run" if drawn else "not run"

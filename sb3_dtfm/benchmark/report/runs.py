@@ -156,7 +156,7 @@ class Group(NamedTuple):
     :param profile: name of the settings
     :param label: name of what else was changed
     :param tasks: those that the table shows, run or not
-    :param runs: by task, regime and algorithm, in the order of seeds
+    :param runs: by task, data_share and algorithm, in the order of seeds
     """
 
     profile: str
@@ -175,10 +175,10 @@ class Group(NamedTuple):
         return list(dict.fromkeys([*PAPER_ALGORITHMS, *sorted(algo for _, _, algo in self.runs)]))
 
     @property
-    def regimes(self) -> list[float]:
+    def data_shares(self) -> list[float]:
         """Shares of the data, the paper's (unless it is another comparison) and those run, largest first."""
         paper = () if self.label or self.has_baselines else PAPER_REGIMES
-        return sorted({*paper, *(regime for _, regime, _ in self.runs)}, reverse=True)
+        return sorted({*paper, *(data_share for _, data_share, _ in self.runs)}, reverse=True)
 
     @property
     def has_baselines(self) -> bool:
@@ -194,10 +194,10 @@ class Group(NamedTuple):
     def data_sets(self) -> list[tuple[str, str, float]]:
         """Describe all data sets: a name, with a star where a default was chosen with it, the task, its share of data."""
         found = []
-        for task, regime in sorted({(task, regime) for task, regime, _ in self.runs}):
+        for task, data_share in sorted({(task, data_share) for task, data_share, _ in self.runs}):
             star = "*" if any(run.final["data"].get("chosen_with") for run in self.of_task(task)) else ""
-            share = f", {regime:.0%}" if len(self.regimes) > 1 else ""
-            found.append((f"{task}{star}{share}", task, regime))
+            share = f", {data_share:.0%}" if len(self.data_shares) > 1 else ""
+            found.append((f"{task}{star}{share}", task, data_share))
         return found
 
     @property
@@ -210,9 +210,9 @@ class Group(NamedTuple):
         """Return the tasks with runs, all of which report success."""
         return [task for task in self.tasks if (runs := self.of_task(task)) and all(run.counts_success for run in runs)]
 
-    def of(self, task: str, regime: float, algo: str) -> list[Run]:
+    def of(self, task: str, data_share: float, algo: str) -> list[Run]:
         """Runs of all seeds, none if there was no run."""
-        return self.runs.get((task, regime, algo), [])
+        return self.runs.get((task, data_share, algo), [])
 
     def of_task(self, task: str) -> list[Run]:
         """All runs on one task."""
@@ -277,7 +277,7 @@ def group_runs(results: Iterable[Result], tasks: Sequence[str] = ()) -> tuple[li
     for key in sorted(finals):
         group = groups.setdefault((key.profile, key.label), Group(key.profile, key.label, [], {}))
         group.tasks.append(key.task)
-        group.runs.setdefault((key.task, key.regime, key.algo), []).append(Run(key, evaluations[key], finals[key]))
+        group.runs.setdefault((key.task, key.data_share, key.algo), []).append(Run(key, evaluations[key], finals[key]))
     for group in groups.values():
         # A label's changes may not be meant for all tasks.
         first = [task for task in tasks if task in group.tasks] if group.label else tasks
@@ -306,7 +306,7 @@ def final_interval(runs: Sequence[Run]) -> Interval:
 
 
 def score_interval(runs: Sequence[Run]) -> Interval | None:
-    """The same on the scale of scores; None where there is none."""
+    """Student's interval of the final result on the scale of scores; None where there is none."""
     scores = [runs[0].to_score(limit) for limit in final_interval(runs)]
     return None if None in scores else Interval(*scores)  # type: ignore[arg-type]
 
@@ -368,13 +368,13 @@ def paired_scores(
     """
     Scores of the tasks and shares that two algorithms have run.
 
-    :return: task and regime of each, and the runs' scores of the first and of the second
+    :return: task and data_share of each, and the runs' scores of the first and of the second
     """
     found = []
     for task in group.tasks:
-        for regime in group.regimes:
-            scores = [[run.score(measure) for run in group.of(task, regime, each)] for each in (algo, other)]
+        for data_share in group.data_shares:
+            scores = [[run.score(measure) for run in group.of(task, data_share, each)] for each in (algo, other)]
             if all(values and None not in values for values in scores):
-                found.append(((task, regime), *(np.array(values, float) for values in scores)))
+                found.append(((task, data_share), *(np.array(values, float) for values in scores)))
     keys, mine, theirs = map(list, zip(*found, strict=True)) if found else ([], [], [])
     return keys, mine, theirs

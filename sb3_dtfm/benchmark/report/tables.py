@@ -68,7 +68,7 @@ def make_report(studies: Sequence[Study], figures: Mapping[tuple[str, str], Mapp
 
     :param studies: what to report on, in this order
     :param figures: file names by study and title of a group, and by what they show: "scores" beside behaviour cloning,
-        "curves" of learning by gradient step, the same by "minutes", what was "solved" by environment step; each if drawn
+        "curves" of learning by gradient step or by "minutes", what was "solved" by environment step; each if drawn
     :return: Markdown
     """
     parts = ["# DT and DTFM compared", ""]
@@ -104,8 +104,8 @@ def _compact(group: Group) -> list[str]:
     """A row for each data set: what was recorded, and what each algorithm reached."""
     algos = group.baselines_first
     rows = []
-    for name, task, regime in group.data_sets:
-        runs = [group.of(task, regime, algo) for algo in algos]
+    for name, task, data_share in group.data_sets:
+        runs = [group.of(task, data_share, algo) for algo in algos]
         reached = [_reached(each) if each else NOT_RUN for each in runs]
         seeds = [str(len(each)) for each in runs]
         rows.append([_escape(name), _recorded(next(each for each in runs if each)[0]), *reached, "; ".join(seeds)])
@@ -147,10 +147,10 @@ def _task_table(
     header = ["task", "data", *(f"{algo.upper()} {name}" for name in columns for algo in group.algorithms)]
     rows = []
     for task in tasks:
-        for regime in group.regimes:
-            runs = [group.of(task, regime, algo) for algo in group.algorithms]
+        for data_share in group.data_shares:
+            runs = [group.of(task, data_share, algo) for algo in group.algorithms]
             cells = [say(each) if each else NOT_RUN for say in columns.values() for each in runs]
-            rows.append([task, f"{regime:.0%}", *cells, *([last[1](runs)] if last else [])])
+            rows.append([task, f"{data_share:.0%}", *cells, *([last[1](runs)] if last else [])])
     return _table([*header, last[0]] if last else header, rows)
 
 
@@ -341,11 +341,11 @@ def _changes(base: Group, labelled: Sequence[Group]) -> list[str]:
     }
     rows = []
     for group in labelled:
-        for task, regime, algo, runs, same in compared_runs(base, group):
-            settings = _escape(changed_settings(runs[0], base.of(task, regime, algo)))
+        for task, data_share, algo, runs, same in compared_runs(base, group):
+            settings = _escape(changed_settings(runs[0], base.of(task, data_share, algo)))
             cells = [say(each) if each else NOT_RUN for say in columns.values() for each in (runs, same)]
             seeds = f"{len(runs)}; {len(same)} without" if same and len(same) != len(runs) else str(len(runs))
-            rows.append([group.label, settings or NONE, task, f"{regime:.0%}", algo.upper(), *cells, seeds])
+            rows.append([group.label, settings or NONE, task, f"{data_share:.0%}", algo.upper(), *cells, seeds])
     text = (
         "What a label's settings did, beside the runs without it of the same seeds: mean ± standard deviation over seeds, "
         "success in percent or mean return; minutes of training without evaluations; commits of the code that trained them. "
