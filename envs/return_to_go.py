@@ -3,6 +3,7 @@
 import math
 import re
 import time
+import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple, SupportsFloat
 
@@ -36,6 +37,8 @@ CHANNELS = (1, 3, 4)
 WRAPPERS = ("TimeLimit", "Monitor", "ReturnToGoWrapper")
 # In `info` after several actions: what was observed between them.
 BETWEEN = "observations_between"
+# Episodes in a row without an end, after which a warning says so.
+MOST_UNFINISHED = 10
 
 
 def image_spaces(space: spaces.Space) -> dict[str, spaces.Box]:
@@ -199,8 +202,9 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     added up, and `info` has the observations between them, stacked by key, under `BETWEEN`. So whoever decides once for
     several steps does so in each of many parallel environments at its own place in its episode.
 
-    An episode that a `TimeLimit` outside a `Monitor` ends has the `info["episode"]` that the Monitor would have given: SB3's
-    evaluations wait for it.
+    An episode that a wrapper between this one and a `Monitor` ends, such as a `TimeLimit`, has the `info["episode"]` that the
+    Monitor would have given: SB3's evaluations wait for it. They wait for ever for episodes that a wrapper outside of this
+    one ends; a warning tells of ten in a row.
 
     A task that tells of success by another name, as Adroit's hands do, tells it as `is_success` too, which SB3's
     `EvalCallback` and logs know.
@@ -223,6 +227,8 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._vector_space = sort_observation_space(without_images(env.observation_space))
         self._episode_target = self._return_to_go = math.nan
         self._timestep = 0
+        self._ended = False
+        self._n_unfinished = 0  # episodes in a row
 
     @property
     def known_task(self) -> Task | None:
@@ -260,7 +266,9 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                 "ReturnToGoWrapper(env) has no target return yet: give it to a model, DTFM(..., env=env) or "
                 "model.set_env(env), or write ReturnToGoWrapper(env, target_return=model.target_return)."
             )
+        self._count_unfinished()
         observation, info = self.env.reset(seed=seed, options=options)
+        self._ended = False
         self._episode_target = self._return_to_go = self.target_return
         self._timestep = 0
         return self._observe(observation), info
@@ -274,10 +282,24 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         success = reported_success(info)
         if success is not None and "is_success" not in info:  # by which SB3 counts
             info = {**info, "is_success": success}
-        if truncated and not terminated and self._monitor is not None and "episode" not in info:
+        self._ended = terminated or truncated
+        if self._ended and self._monitor is not None and "episode" not in info:
             total, seconds = round(sum(self._monitor.rewards), 6), round(time.time() - self._monitor.t_start, 6)
             info = {**info, "episode": {"r": total, "l": len(self._monitor.rewards), "t": seconds}}
         return self._observe(observation), reward, terminated, truncated, info
+
+    def _count_unfinished(self) -> None:
+        """Warn of episodes that end outside."""
+        if self._ended or self._monitor is None:
+            self._n_unfinished = 0
+        elif self._timestep > 0:
+            self._n_unfinished += 1
+            if self._n_unfinished == MOST_UNFINISHED:
+                warnings.warn(
+                    f"{MOST_UNFINISHED} episodes in a row were reset before ReturnToGoWrapper and Monitor saw their ends, for "
+                    "which SB3's evaluations wait. If a wrapper outside ends them, write ReturnToGoWrapper(ItsWrapper(env)).",
+                    stacklevel=3,
+                )
 
     def _step_through(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
         """:param actions: (N, A)"""

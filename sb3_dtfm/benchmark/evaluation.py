@@ -181,6 +181,8 @@ class EvaluationCallback(BaseCallback):
     :param n_final_episodes: episodes of the last one, on the other initial states
     :param n_envs: environments side by side
     :param subprocesses: each in a process of its own
+    :ivar after_step: called after each step of an evaluation; an exception of it ends the evaluation, which a resumed run
+        repeats
     """
 
     def __init__(
@@ -201,6 +203,7 @@ class EvaluationCallback(BaseCallback):
         self.n_final_episodes = n_final_episodes
         self.n_envs = n_envs
         self.subprocesses = subprocesses
+        self.after_step: Callable[[], None] = lambda: None
         self._resumed, self._training_seconds, self._reported = 0.0, 0.0, 0.0
 
     def _init_callback(self) -> None:
@@ -210,12 +213,14 @@ class EvaluationCallback(BaseCallback):
     def _on_training_start(self) -> None:
         self._resumed = time.perf_counter()
         if self.num_timesteps == 0:
-            self.rows.unlink(missing_ok=True)  # of an attempt that was killed before its first checkpoint
+            if self.rows.exists():  # of an attempt that was killed before its first checkpoint
+                read_rows(self.rows, torn_end=True)  # and nothing else
+                self.rows.unlink()
             self._evaluate(final=False)
         else:
-            self._restore_rows()
+            self._evaluate_missing(self._restore_rows())
 
-    def _restore_rows(self) -> None:
+    def _restore_rows(self) -> list[Row]:
         """Keep an interrupted run's rows up to its checkpoint; steps behind the last row took as long as those before it."""
         rows = [row for row in read_rows(self.rows, torn_end=True) if row["step"] <= self.num_timesteps]
         with replacing(self.rows) as beside:
@@ -223,15 +228,21 @@ class EvaluationCallback(BaseCallback):
                 write_row(beside, row)
         timed = next((row for row in reversed(rows) if row["step"] > 0), None)
         self._training_seconds = timed["wall_s"] * self.num_timesteps / timed["step"] if timed else 0.0
+        return rows
 
     def _on_step(self) -> bool:
         self._report("training")
-        last = self.num_timesteps == self.model._total_timesteps
-        if last or self.num_timesteps % self.eval_freq == 0:
-            self._evaluate(final=False)
-        if last:
-            self._evaluate(final=True)
+        self._evaluate_missing([])
         return True
+
+    def _evaluate_missing(self, rows: Sequence[Row]) -> None:
+        """:param rows: of evaluations that need no repetition"""
+        last = self.num_timesteps == self.model._total_timesteps
+        there = {row["final"] for row in rows if row["step"] == self.num_timesteps}
+        if (last or self.num_timesteps % self.eval_freq == 0) and False not in there:
+            self._evaluate(final=False)
+        if last and True not in there:
+            self._evaluate(final=True)
 
     def _on_training_end(self) -> None:
         self.vec_env.close()
@@ -241,7 +252,12 @@ class EvaluationCallback(BaseCallback):
         first, n_episodes = (FINAL_STATES, self.n_final_episodes) if final else (TRAINING_STATES, self.n_episodes)
         what = f"{'final ' if final else ''}evaluation"
         seeds = range(first, first + n_episodes)
-        episodes = evaluate(self.model, self.vec_env, seeds, lambda n_done: self._report(f"{what} {n_done}/{n_episodes}"))
+
+        def after_step(n_done: int) -> None:
+            self.after_step()
+            self._report(f"{what} {n_done}/{n_episodes}")
+
+        episodes = evaluate(self.model, self.vec_env, seeds, after_step)
         acting: Row = getattr(self.model.policy, "acting_settings", dict)()  # SB3's algorithms have none
         evaluation: Row = dict(
             step=self.num_timesteps,

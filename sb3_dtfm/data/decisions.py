@@ -29,8 +29,8 @@ FEW_STEPS_PER_DIMENSION, DROPOUT = 250, 0.2
 
 # Settings that the data decide where the user gives none.
 DECIDED = frozenset(
-    ("batch_size", "flow_draws", "dropout", "return_conditioning", "return_weighting", "expected_return_steps", "return_range",
-     "chunk_size", "flow_steps", "regression_coef", "timestep_embedding", "observation_scaling")
+    ("batch_size", "flow_draws", "dropout", "return_conditioning", "return_weighting", "expected_return_steps",
+     "return_range", "chunk_size", "flow_steps", "regression_coef", "timestep_embedding", "observation_scaling")
 )  # fmt: skip
 
 

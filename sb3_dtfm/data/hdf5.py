@@ -60,6 +60,35 @@ def open_hdf5(
     :param encoded: accept strings of bytes, too
     """
     what = f"{where}: {name}"
+    data, shape, dtype, n_stored = _opened(group, name, where)
+    strings = h5py.check_vlen_dtype(dtype) == np.uint8
+    if strings and not encoded:
+        raise DatasetError(f"{what} {STORED_AS_JPEG}")
+    check_real(np.uint8 if strings else dtype, what)
+    if not shape:
+        raise DatasetError(f"{what} have shape {shape}; one entry for each step is expected.")
+    _check_stored(data, shape, dtype, n_stored, what)
+    return data, shape, dtype
+
+
+def read_names(group: h5py.Group, name: str, where: str) -> list[str]:
+    """
+    An array of names.
+
+    :param group: as for :func:`read_hdf5`, which says the rest too
+    """
+    what = f"{where}: {name}"
+    data, shape, dtype, n_stored = _opened(group, name, where)
+    if dtype.kind != "S" and h5py.check_string_dtype(dtype) is None:
+        raise DatasetError(f"{what} hold {dtype}; names are expected.")
+    _check_stored(data, shape, dtype, n_stored, what)
+    with wrap_dataset_errors(what):
+        return [each.decode() for each in np.asarray(h5py.Dataset(data)[()]).reshape(-1).tolist()]
+
+
+def _opened(group: h5py.Group, name: str, where: str) -> tuple[h5py.h5d.DatasetID, tuple[int, ...], np.dtype, int]:
+    """An array that lies in the file, its shape and its type, and the bytes that are stored of it."""
+    what = f"{where}: {name}"
     check_within(group, name, where)
     try:
         data = h5py.h5d.open(group.id, name.encode())
@@ -73,13 +102,11 @@ def open_hdf5(
     with wrap_dataset_errors(what):
         if not _stored_within(data):  # what is there can change without a trace, or be what nobody meant to give away
             raise DatasetError(f"{what} lie in another file; one file that holds everything is accepted.")
-        shape, dtype, n_stored = data.shape, data.dtype, data.get_storage_size()
-    strings = h5py.check_vlen_dtype(dtype) == np.uint8
-    if strings and not encoded:
-        raise DatasetError(f"{what} {STORED_AS_JPEG}")
-    check_real(np.uint8 if strings else dtype, what)
-    if not shape:
-        raise DatasetError(f"{what} have shape {shape}; one entry for each step is expected.")
+        return data, data.shape, data.dtype, data.get_storage_size()
+
+
+def _check_stored(data: h5py.h5d.DatasetID, shape: tuple[int, ...], dtype: np.dtype, n_stored: int, what: str) -> None:
+    """Refuse an array of which less is stored than it claims."""
     n_bytes = math.prod(shape) * dtype.itemsize
     if n_bytes and not n_stored:
         raise DatasetError(f"{what} have shape {shape}, of which nothing has been written; the file is incomplete.")
@@ -87,7 +114,6 @@ def open_hdf5(
     with wrap_dataset_errors(what):
         if n_bytes and data.get_offset() is None:
             _check_chunks(data, shape, what)
-    return data, shape, dtype
 
 
 def describe_hdf5(group: h5py.Group, name: str, where: str) -> tuple[tuple[int, ...], np.dtype] | None:

@@ -16,7 +16,7 @@ from sb3_dtfm.actions import ActionSpace
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.cache import Fingerprint, existing_file
 from sb3_dtfm.data.flat import bounded_space, explain_range, fitted, json_options, warn_of_made_up_rewards
-from sb3_dtfm.data.hdf5 import check_within, listed, open_group, open_hdf5, read_hdf5
+from sb3_dtfm.data.hdf5 import listed, open_group, open_hdf5, read_hdf5, read_names
 from sb3_dtfm.data.observations import Observed, is_images, observed
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_finite, check_flags, wrap_dataset_errors
@@ -215,9 +215,7 @@ def _filtered(file: h5py.File, source: str, filter_key: str, demos: list[str]) -
     masks = open_group(file, "mask", source) if "mask" in set(file) else {}
     if filter_key not in set(masks):
         raise DatasetError(f"{source}: has no filter key {filter_key!r}; available: {listed(masks)}.")
-    check_within(masks, filter_key, f"{source}: mask")
-    chosen = np.asarray(masks[filter_key][()]).reshape(-1).tolist()
-    names = [name.decode() if isinstance(name, bytes) else str(name) for name in chosen]
+    names = read_names(masks, filter_key, f"{source}: mask")
     missing = sorted(set(names) - set(demos), key=_number)
     if missing:
         raise DatasetError(f"{source}: filter key {filter_key!r} lists {missing[0]!r}, which is not in group 'data'.")

@@ -23,6 +23,7 @@ EVALUATED = ("normalize", "policy_kwargs", "replay_buffer_class", "replay_buffer
 # Those of both that matter to whoever acts with a model.
 OF_ACTING = ("env_wrapper", "vec_env_wrapper", "normalize")
 ENV_KWARGS = ("env_kwargs", "eval_env_kwargs")
+TASKS = ("task", "env", "env_id")
 
 
 def read_run(run: Path) -> dict[str, Any]:
@@ -108,6 +109,7 @@ def check_settings(settings: Mapping[str, Any], where: str, names: Sequence[str]
             listed = settings[name] if isinstance(settings[name], list) else [settings[name]]
             for each in listed:
                 _check_class(next(iter(each), None) if isinstance(each, dict) else each, name, where)
+                _check_nested(each, f"{where}: {name}")
         elif isinstance(settings[name], str):
             try:
                 settings[name] = literal(settings[name])
@@ -120,6 +122,17 @@ def check_settings(settings: Mapping[str, Any], where: str, names: Sequence[str]
     if "allow_pickle" in (settings.get("dataset_kwargs") or {}):
         raise ValueError(f"{where}: dataset_kwargs: allow_pickle is given on the command line or not at all.")
     return settings
+
+
+def _check_nested(value: Any, where: str) -> None:
+    """Check settings among a class's arguments, from which it may make environments, as the benchmark's evaluations do."""
+    if isinstance(value, dict):
+        check_settings(value, where, OF_ACTING)
+        for task in (value.get(key) for key in TASKS):
+            if isinstance(task, str) and ":" in task:  # whose module Gymnasium would import
+                raise ValueError(f"{where}: expected the id of a registered task, found {task!r}.")
+    for each in value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ():
+        _check_nested(each, where)
 
 
 def _check_class(named: Any, name: str, where: str) -> None:

@@ -268,8 +268,12 @@ class OfflineExperimentManager(ExperimentManager):
         random = MeasureRandomActions(evaluations, self.seed, self.signals.end_evaluation)
         self.callbacks[first:first] = [random, SeedEvaluations(evaluations, self.seed)]
         self.evaluations = evaluations
-        for evaluation in evaluations if self.signals.between_steps else ():
-            self.signals.watch(evaluation)
+        if self.signals.between_steps:
+            for evaluation in evaluations:
+                self.signals.watch(evaluation)
+            for callback in self.callbacks:
+                if hasattr(callback, "after_step"):  # an evaluation of another kind, as the benchmark's
+                    callback.after_step = self.signals.end_evaluation
         self.keeper = KeepCheckpoint(Path(self.save_path), self.signals, self.start)
         self.callbacks += [EvaluateAtStartAndEnd(evaluations), ReplaceEvaluations(evaluations), self.keeper]
 

@@ -1,5 +1,6 @@
 """Evaluation counts each initial state once, whatever the number of environments and the lengths of episodes."""
 
+import contextlib
 import time
 import warnings
 from typing import Any
@@ -23,9 +24,10 @@ from sb3_dtfm.benchmark.evaluation import (
     evaluate,
     make_seeded_envs,
 )
-from sb3_dtfm.benchmark.rows import RunKey, read_rows
+from sb3_dtfm.benchmark.rows import RowError, RunKey, read_rows, write_row
 from sb3_dtfm.benchmark.runner import CALLBACK
 from sb3_dtfm.envs import ReturnToGoWrapper
+from tests.benchmark.conftest import make_row
 from tests.conftest import TINY_FLOW_POLICY
 
 
@@ -143,7 +145,7 @@ def test_rows_come_before_during_and_after_training_and_at_the_end_on_other_stat
     tmp_path, row, cheetah_buffer, capsys
 ):
     file = tmp_path / "rows.jsonl"
-    file.write_text('{"of an attempt": "that was killed before its first checkpoint"}\n')
+    write_row(file, make_row(step=5))  # of an attempt that was killed before its first checkpoint
     model = make_model(cheetah_buffer)
     model.learn(7, EvaluationCallback(str(file), row, eval_freq=3, n_episodes=2, n_final_episodes=4, n_envs=2))
     rows = read_rows(file)
@@ -174,6 +176,39 @@ def test_the_first_evaluation_is_of_the_untrained_weights(tmp_path, row, cheetah
     rows = read_rows(tmp_path / "rows.jsonl")
     assert rows[0]["returns"] == expected.returns
     assert rows[1]["returns"] != expected.returns
+
+
+def test_an_interrupted_evaluation_is_repeated(tmp_path, row, cheetah_buffer):
+    """At the end of the steps, too, where nothing is left to be trained."""
+
+    class EndedError(Exception):
+        pass
+
+    def run(model: DTFM, steps: int, end_at: int | None = None) -> list[tuple[int, bool]]:
+        callback = EvaluationCallback(str(tmp_path / "rows.jsonl"), row, eval_freq=2, n_episodes=1, n_final_episodes=2)
+
+        def after_step() -> None:
+            if callback.num_timesteps == end_at:
+                raise EndedError
+
+        callback.after_step = after_step
+        with contextlib.suppress(EndedError):
+            model.learn(steps, callback, reset_num_timesteps=model.num_timesteps == 0)
+        return [(each["step"], each["final"]) for each in read_rows(tmp_path / "rows.jsonl")]
+
+    model = make_model(cheetah_buffer)
+    assert run(model, 4, end_at=2) == [(0, False)]
+    assert run(model, 2, end_at=4) == [(0, False), (2, False)]
+    assert run(model, 0) == [(0, False), (2, False), (4, False), (4, True)]
+
+
+def test_another_file_is_not_taken_for_rows(tmp_path, row, cheetah_buffer):
+    other = tmp_path / "other.txt"
+    other.write_text("mine\n")
+    callback = EvaluationCallback(str(other), row, eval_freq=2, n_episodes=1, n_final_episodes=1)
+    with pytest.raises(RowError, match=r"other.txt, line 1: is not JSON"):
+        make_model(cheetah_buffer).learn(1, callback)
+    assert other.read_text() == "mine\n"
 
 
 def test_evaluating_changes_no_training(tmp_path, row, cheetah_buffer):

@@ -12,6 +12,7 @@ from gymnasium import spaces
 from sb3_dtfm.data import load_dataset
 from sb3_dtfm.data.robomimic import load_robomimic
 from sb3_dtfm.data.trajectories import DatasetError
+from tests.data import corpus
 
 ROBOT = {"robot0_eef_pos": 3, "robot0_eef_quat": 4, "robot0_gripper_qpos": 2}
 OLD_CONTROLLER = {"type": "OSC_POSE", "input_max": 1, "input_min": -1, "control_delta": True, "kp": 150}
@@ -169,6 +170,19 @@ def test_filter_key_selects(path, dtype):
     write(path, demos, masks={"train": names, "valid": np.array(["demo_1"], dtype="S")})
     assert load_robomimic(path, filter_key="train").episode_lengths.tolist() == [3, 5, 11]
     assert load_robomimic(path).n_episodes == 12
+
+
+OF_NUMBERS = {"some chunks unwritten", "a cut szip chunk", "a cut scaleoffset chunk"}  # which names cannot be
+
+
+@pytest.mark.parametrize("what", sorted({name for name, (_, right) in corpus.HDF5.items() if right is None} - OF_NUMBERS))
+def test_a_bad_mask_is_refused_as_a_bad_array_is(what, path):
+    names = np.array(["demo_0", "demo_1"] * 4, "S")
+    write(path, {f"demo_{i}": make_demo(3, success_at=2) for i in range(2)}, masks={"train": names})
+    with h5py.File(path, "r+") as file:
+        corpus.HDF5[what][0](file, "mask/train", path.parent)
+    with corpus.time_limit(), pytest.raises(DatasetError, match=r"mask|filter key"):
+        load_robomimic(path, filter_key="train")
 
 
 def test_observation_keys_are_chosen_in_order(path):

@@ -267,6 +267,10 @@ def test_the_task_is_known_where_its_whole_spec_cannot_leave_a_process(vec_env_c
     assert known_task(DummyVecEnv([lambda: ReturnToGoWrapper(bare, target_return=0.0)])) is None
 
 
+def bare_env() -> gym.Env:
+    return ConstantReward(spaces.Box(-1.0, 1.0, (2,)), np.zeros(2, np.float32))
+
+
 class OwnTimeLimit(TimeLimit):
     """As RL-Zoo has one."""
 
@@ -278,8 +282,7 @@ class Horizon(TimeLimit):
 @pytest.mark.parametrize("vec_env_class", [DummyVecEnv, SubprocVecEnv])
 def test_an_evaluation_ends_where_a_time_limit_stands_outside_the_monitor(vec_env_class):
     def make() -> gym.Env:
-        bare = ConstantReward(spaces.Box(-1.0, 1.0, (2,)), np.zeros(2, np.float32))
-        return ReturnToGoWrapper(TimeLimit(Monitor(bare), 7), 1.0)
+        return ReturnToGoWrapper(TimeLimit(Monitor(bare_env()), 7), 1.0)
 
     env = vec_env_class([make])
     check_vec_env(env)
@@ -293,11 +296,43 @@ def test_an_evaluation_ends_where_a_time_limit_stands_outside_the_monitor(vec_en
     assert lengths == [7, 7]
 
 
+class EndAfterThree(gym.Wrapper):
+    """Ends episodes as a success does."""
+
+    def reset(self, **kwargs):
+        self.n_steps = 0
+        return self.env.reset(**kwargs)
+
+    def step(self, action):
+        self.n_steps += 1
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated or self.n_steps == 3, truncated, info
+
+
+def test_an_end_outside_the_monitor_is_told_whichever_it_is():
+    env = DummyVecEnv([lambda: ReturnToGoWrapper(EndAfterThree(Monitor(bare_env())), 1.0)])
+    model = PPO("MultiInputPolicy", env, n_steps=8, batch_size=8, device="cpu")
+    assert evaluate_policy(model, env, 2, return_episode_rewards=True)[1] == [3, 3]
+
+
+def test_ends_that_no_monitor_sees_are_warned_of():
+    for wrapped, n_warnings in [
+        (EndAfterThree(ReturnToGoWrapper(Monitor(bare_env()), 1.0)), 1),
+        (ReturnToGoWrapper(EndAfterThree(Monitor(bare_env())), 1.0), 0),
+        (Monitor(EndAfterThree(ReturnToGoWrapper(bare_env(), 1.0))), 0),
+    ]:
+        env = DummyVecEnv([lambda wrapped=wrapped: wrapped])
+        env.reset()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            for _ in range(60):
+                env.step(np.zeros((1, 2)))
+        told = [str(each.message) for each in caught if "ReturnToGoWrapper(ItsWrapper(env))" in str(each.message)]
+        assert len(told) == n_warnings
+
+
 @pytest.mark.parametrize("vec_env_class", [DummyVecEnv, SubprocVecEnv])
 def test_a_time_limit_outside_of_everything_is_refused(vec_env_class):
-    def bare() -> gym.Env:
-        return ConstantReward(spaces.Box(-1.0, 1.0, (2,)), np.zeros(2, np.float32))
-
     def check(*makers) -> None:
         env = vec_env_class(list(makers))
         try:
@@ -306,12 +341,12 @@ def test_a_time_limit_outside_of_everything_is_refused(vec_env_class):
             env.close()
 
     good = [
-        lambda: Monitor(TimeLimit(ReturnToGoWrapper(bare(), 1.0), 7)),
-        lambda: TimeLimit(ReturnToGoWrapper(bare(), 1.0), 7),
-        lambda: ReturnToGoWrapper(TimeLimit(Monitor(bare()), 7), 1.0),
+        lambda: Monitor(TimeLimit(ReturnToGoWrapper(bare_env(), 1.0), 7)),
+        lambda: TimeLimit(ReturnToGoWrapper(bare_env(), 1.0), 7),
+        lambda: ReturnToGoWrapper(TimeLimit(Monitor(bare_env()), 7), 1.0),
     ]
     check(*good)
     limits = [TimeLimit, OwnTimeLimit, *([Horizon] if vec_env_class is DummyVecEnv else [])]
     for limit in limits:
         with pytest.raises(ValueError, match=r"write ReturnToGoWrapper\(TimeLimit\(env, max_episode_steps=N\)\)"):
-            check(*good, lambda limit=limit: limit(ReturnToGoWrapper(Monitor(bare()), 1.0), 7))
+            check(good[0], lambda limit=limit: limit(ReturnToGoWrapper(Monitor(bare_env()), 1.0), 7))

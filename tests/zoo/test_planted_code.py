@@ -18,6 +18,7 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from stable_baselines3 import PPO, SAC
 
+from sb3_dtfm.benchmark.runner import CALLBACK
 from sb3_dtfm.cli.main import main
 from sb3_dtfm.files import literal, read_run
 from sb3_dtfm.zoo.manager import TrainingError
@@ -208,6 +209,12 @@ def test_anything_else_is_not(text):
         literal(text)
 
 
+def evaluating(**row: object) -> dict:
+    """Arguments of the benchmark's evaluations."""
+    plain = {"task": "HalfCheetah-v5", "settings": {}}
+    return dict(rows="rows.jsonl", row={**plain, **row}, eval_freq=1, n_episodes=1, n_final_episodes=1)
+
+
 PACKAGED = ["--conf-file", str(packaged_config("dtfm"))]
 OF_START = {
     "-params": (["-params", f"a:{CODE}"], "-params a:__import__"),
@@ -220,6 +227,14 @@ OF_START = {
     "a callback": (["-params", "callback:[{'os.mkdir': {'path': 'ran'}}]"], "callback names 'os.mkdir'"),
     "a planted callback": (["-params", f"callback:'{PLANTED}.Wrapper'"], f"--gym-packages {PLANTED}"),
     "a wrapper": (["-params", "env_wrapper:'os.mkdir'"], "env_wrapper names 'os.mkdir'"),
+    "a wrapper of a callback's environments": (
+        ["-params", f"callback:[{{'{CALLBACK}': {evaluating(settings={'env_wrapper': [{'os.mkdir': {'path': 'ran'}}]})}}}]"],
+        "env_wrapper names 'os.mkdir'",
+    ),
+    "a task of a callback's environments": (
+        ["-params", f"callback:[{{'{CALLBACK}': {evaluating(task=f'{PLANTED}:HalfCheetah-v5')}}}]"],
+        "expected the id of a registered task",
+    ),
     "a policy": (["-params", f"policy:'{PLANTED}.Wrapper'"], "policy names"),
     "a package": (["--gym-packages", PLANTED], f"--gym-packages {PLANTED}"),
     "an abbreviated package": (["--gym", PLANTED], f"--gym-packages {PLANTED}"),
