@@ -202,9 +202,9 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     added up, and `info` has the observations between them, stacked by key, under `BETWEEN`. So whoever decides once for
     several steps does so in each of many parallel environments at its own place in its episode.
 
-    An episode that a wrapper between this one and a `Monitor` ends, such as a `TimeLimit`, has the `info["episode"]` that the
-    Monitor would have given: SB3's evaluations wait for it. They wait for ever for episodes that a wrapper outside of this
-    one ends; a warning tells of ten in a row.
+    An episode that a wrapper between this one and a `Monitor` ends, such as a `TimeLimit`, has the `info["episode"]` that
+    the Monitor would have given: SB3's evaluations wait for it. They wait for ever for episodes that a wrapper outside of
+    this one ends; a warning tells of ten in a row.
 
     A task that tells of success by another name, as Adroit's hands do, tells it as `is_success` too, which SB3's
     `EvalCallback` and logs know.
@@ -296,8 +296,9 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             self._n_unfinished += 1
             if self._n_unfinished == MOST_UNFINISHED:
                 warnings.warn(
-                    f"{MOST_UNFINISHED} episodes in a row were reset before ReturnToGoWrapper and Monitor saw their ends, for "
-                    "which SB3's evaluations wait. If a wrapper outside ends them, write ReturnToGoWrapper(ItsWrapper(env)).",
+                    f"{MOST_UNFINISHED} episodes in a row were reset before ReturnToGoWrapper and Monitor saw their ends, "
+                    "for which SB3's evaluations wait. If a wrapper outside ends them, put it inside: write "
+                    "ReturnToGoWrapper(ItsWrapper(env)).",
                     stacklevel=3,
                 )
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.report.statistics import wilson
+from sb3_dtfm.files import read_evaluations
 from sb3_dtfm.zoo.resuming import EPISODES
 
 if TYPE_CHECKING:
@@ -62,12 +63,12 @@ def load_evaluations(run_folder: Path | str) -> dict[str, np.ndarray]:
 
     :return: `timesteps` (E,), `results` (E, n) in environment reward units, and where the task has them `successes` (E, n)
     :raises FileNotFoundError: the run was not evaluated while it trained
+    :raises ValueError: a damaged file, or another one
     """
     path = Path(run_folder) / "evaluations.npz"
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist; expected the folder of a run with evaluations (train --eval-freq).")
-    with np.load(path) as arrays:
-        return dict(arrays)
+    return read_evaluations(path)
 
 
 def load_loss(tensorboard_folder: Path | str) -> tuple[np.ndarray, np.ndarray]:

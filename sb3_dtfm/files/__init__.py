@@ -1,5 +1,6 @@
 """Files: how one is replaced, what a saved model is made of, and an exported one; what a run tells of its environment."""
 
+from sb3_dtfm.files.evaluations import read_evaluations
 from sb3_dtfm.files.model import (
     ModelFile,
     ModelFileError,
@@ -27,6 +28,7 @@ __all__ = [
     "literal",
     "printable",
     "read_configuration",
+    "read_evaluations",
     "read_model",
     "read_run",
     "replacing",

@@ -8,6 +8,7 @@ file. The algorithm interprets the numbers; this module only writes them to disk
 import contextlib
 import hashlib
 import json
+import math
 import zipfile
 from collections.abc import Iterator, Set
 from pathlib import Path
@@ -202,7 +203,8 @@ class _Reader:
         if CONFIGURATION not in self.infos:
             self.fail(f"no model of DT or DTFM: {CONFIGURATION} is missing.")
         try:
-            configuration = json.loads(self._content(CONFIGURATION, MAX_CONFIGURATION), parse_constant=self._no_number)
+            content = self._content(CONFIGURATION, MAX_CONFIGURATION)
+            configuration = json.loads(content, parse_constant=self._no_number, parse_float=self._finite)
         except ModelFileError:
             raise
         except (ValueError, RecursionError) as error:  # also a number of more digits than Python converts
@@ -221,6 +223,10 @@ class _Reader:
             module = json.loads(self._content(PICKLED_DATA, MAX_CONFIGURATION))["policy_class"]["__module__"]
             return str(module.partition(".")[0])
         return None
+
+    def _finite(self, text: str) -> float:
+        number = float(text)
+        return self._no_number(text) if math.isinf(number) else number  # 1e999
 
     def _no_number(self, text: str) -> NoReturn:
         self.fail(f"{CONFIGURATION} holds {text}; numbers must be finite.")

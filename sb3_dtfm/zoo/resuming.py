@@ -20,7 +20,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from sb3_dtfm.arguments import BOOLEAN, check_arguments
 from sb3_dtfm.callbacks import EvaluateAtStartAndEnd
-from sb3_dtfm.files import replacing
+from sb3_dtfm.files import read_evaluations, replacing
 from sb3_dtfm.finetuning import OnlineDTFM
 from sb3_dtfm.zoo.arguments import START, UsageError
 
@@ -312,8 +312,8 @@ def _restore_evaluations(callback: EvalCallback, path: Path, num_timesteps: int)
     :raises UsageError: there are none to tell how good the best model is
     """
     try:
-        with np.load(path, allow_pickle=False) as saved:
-            kept = {name: saved[name][saved["timesteps"] <= num_timesteps].tolist() for name in saved.files}
+        saved = read_evaluations(path)
+        kept = {name: array[saved["timesteps"] <= num_timesteps].tolist() for name, array in saved.items()}
         best = float(max(map(np.mean, kept["results"])))
         if not np.isfinite(best) or len({len(kept[name]) for name in ("timesteps", "results", "ep_lengths")}) > 1:
             raise ValueError("the evaluations do not go together")

@@ -413,7 +413,7 @@ def test_a_baseline_is_drawn(tmp_path, monkeypatch):
         ([str(ROWS), "--baseline", "SAC=a.npz"], "of which task? Write TASK:SAC=FILE"),
         ([str(ROWS), "--baseline", "Ant-v5:SAC=a.npz"], f"the results hold {CHEETAH}, {LIFT}"),
         ([str(ROWS), "--baseline", f"{LIFT}:SAC=a.npz"], "holds no successes"),
-        ([str(ROWS), "--baseline", "SAC=b.npz"], "expected timesteps and results"),
+        ([str(ROWS), "--baseline", "SAC=b.npz"], "expected the arrays timesteps"),
     ],
 )
 def test_a_mistake_ends_in_one_clear_line(arguments, message, tmp_path, monkeypatch, capsys):

@@ -1,9 +1,12 @@
 """The learning curve of a run: what is drawn, and that the picture says what it shows."""
 
+import pickle
+
 import numpy as np
 import pytest
 from torch.utils.tensorboard import SummaryWriter
 
+from sb3_dtfm.cli.main import main
 from sb3_dtfm.cli.plot import load_evaluations, plot_learning_curve
 
 
@@ -26,6 +29,32 @@ def test_a_folder_without_tensorboards_events_is_refused(tmp_path):
         with pytest.raises(FileNotFoundError, match=f"{folder} holds no TensorBoard events; expected"):
             plot_learning_curve(tmp_path, tmp_path / "curve.png", tmp_path / folder)
     assert not (tmp_path / "curve.png").exists()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        dict(results=np.ones((2, 3))),
+        dict(timesteps=[0, 10], results=np.ones((3, 3))),
+        dict(timesteps=[0, 10], results=np.array([{}, {}])),
+        dict(timesteps=[0, 10], results=np.ones((2, 3)), successes=np.ones(2)),
+        b"",
+        b"text",
+        b"PK\3\4",
+        pickle.dumps(0),
+    ],
+    ids=["no steps", "another number", "objects", "successes of another shape", "empty", "text", "cut off", "pickled"],
+)
+def test_damaged_evaluations_are_named(content, tmp_path, capsys):
+    path = tmp_path / "evaluations.npz"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        np.savez(path, **content)
+    assert main(["plot", str(tmp_path)]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert f"{path} is damaged, or no file of SB3's EvalCallback" in line
+    assert "expected the arrays timesteps (E,) and results (E, n)" in line
 
 
 @pytest.mark.parametrize(

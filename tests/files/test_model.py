@@ -323,6 +323,10 @@ BAD_CONFIGURATIONS = [
     (("attributes", "batch_size"), 1.5, "batch_size must be"),
     (("attributes", "num_timesteps"), -1, "num_timesteps must be"),
     (("attributes", "num_timesteps"), 10**400, "num_timesteps must be"),
+    (("attributes", "warmup_steps"), 10**300, "warmup_steps must be"),
+    (("attributes", "time_limit"), 2**200, "time_limit must be"),
+    (("attributes", "policy_kwargs", "expected_return_steps"), 2**63, "expected_return_steps must be"),
+    (("attributes", "return_reference"), [0.0, 0.0, 0.0, 10**300, False, None, None], "return_reference"),
     (("attributes", "dataset"), "evil.npz", "'dataset' is no attribute"),
     (("attributes", "tensorboard_log"), "/etc", "'tensorboard_log' is no attribute"),
     (("attributes", "note"), "plain", "'note' is no attribute"),
@@ -452,7 +456,7 @@ def test_members_that_are_missing_too_many_or_not_what_they_claim_are_refused(sa
         assert name in refused(packed({key: part for key, part in parts.items() if key != name}), tmp_path)
     assert "notes.txt: nothing of this name" in refused(packed({**parts, "notes.txt": b"hello"}), tmp_path)
     assert "is compressed" in refused(packed(parts, zipfile.ZIP_DEFLATED), tmp_path)
-    for text in (b"{", b"[]", b"\xff", b"[" * 10**5, b'{"format": NaN}', b"7" * 5000):
+    for text in (b"{", b"[]", b"\xff", b"[" * 10**5, b'{"format": NaN}', b'{"format": 1e999}', b"7" * 5000):
         assert "model.json" in refused(packed({**parts, "model.json": text}), tmp_path)
     claims = struct.pack("<Q", 2**62) + parts["policy.safetensors"][8:]
     forged_header = forged(packed({**parts, "policy.safetensors": claims}), lambda configuration: None)

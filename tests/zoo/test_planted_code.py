@@ -468,7 +468,7 @@ RUNS_NOTHING = {
         ["pull", "--algo", "dtfm", *ENV, "-orga", "me", "--repo-folder", "repository"],
         "saved by another algorithm",
     ),
-    "plot, arrays": (["plot", "plotted"], "allow_pickle=False"),
+    "plot, arrays": (["plot", "plotted"], "plotted/evaluations.npz is damaged, or no file of SB3's EvalCallback"),
     "report --baseline, arrays": (["report", "results", "--baseline", "a=plotted/evaluations.npz"], ""),
 }
 

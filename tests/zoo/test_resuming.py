@@ -286,6 +286,7 @@ DAMAGES = [
     confuse,
     lambda path: path.write_bytes(b""),
     lambda path: path.write_text("x"),
+    lambda path: (path.unlink(), os.mkfifo(path)),
 ]
 
 
@@ -295,12 +296,14 @@ def test_without_its_evaluations_a_run_does_not_replace_its_best_model(straight,
     whole, best = path.read_bytes(), model.read_bytes()
     (RUN / ".evaluations.npz").write_bytes(whole[:99])  # of a process that was killed while it wrote
     for damage in DAMAGES:
+        path.unlink(missing_ok=True)
         path.write_bytes(whole)
         damage(path)
         assert main(["train", "--resume", str(RUN)]) == 2
         error = capsys.readouterr().err.strip().splitlines()[-1]
         assert f"{path}: expected the evaluations up to step {SIGNAL_AT + 1}" in error
         assert model.read_bytes() == best
+    path.unlink()
     path.write_bytes(whole)
     assert resume() == 0
     assert_same(what_was_learned(), straight)

@@ -18,6 +18,7 @@ from sb3_dtfm.benchmark.report.runs import (
     score_interval,
     steps_to_success,
 )
+from sb3_dtfm.files import read_evaluations
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -76,11 +77,9 @@ def read_baseline(text: str) -> Baseline:
         raise ValueError(f"--baseline {text}: expected NAME=FILE or TASK:NAME=FILE.")
     if not Path(file).is_file():
         raise FileNotFoundError(f"--baseline {text}: {file} does not exist; expected an evaluations.npz of an SB3 run.")
-    with np.load(file) as arrays:
-        if not {"timesteps", "results"} <= set(arrays):
-            raise ValueError(f"--baseline {text}: {file} holds {', '.join(arrays)}, expected timesteps and results.")
-        successes = 100.0 * arrays["successes"].mean(axis=1) if "successes" in arrays else None
-        return Baseline(task if colon else None, name, arrays["timesteps"], arrays["results"].mean(axis=1), successes)
+    arrays = read_evaluations(Path(file))
+    successes = 100.0 * arrays["successes"].mean(axis=1) if "successes" in arrays else None
+    return Baseline(task if colon else None, name, arrays["timesteps"], arrays["results"].mean(axis=1), successes)
 
 
 def check_baselines(baselines: Sequence[Baseline], tasks: Sequence[str]) -> None:
