@@ -19,6 +19,7 @@ from sb3_dtfm.cli import train
 from sb3_dtfm.cli.plot import plot_learning_curve
 from sb3_dtfm.files import read_run, replacing
 from sb3_dtfm.recording.demonstrations import record_demonstrations
+from sb3_dtfm.zoo.arguments import at_least
 
 ENV_ID = "robosuite/Lift-v0"
 ENV_NAME = ENV_ID.replace("/", "-")  # RL-Zoo's spelling in folders
@@ -41,9 +42,9 @@ def main(argv: Sequence[str]) -> None:
         description="Record demonstrations of robosuite's Lift, train DTFM on half of them, and measure its success.",
     )
     parser.add_argument("--output", default="demo", metavar="FOLDER", help="where everything goes, ./demo by default")
-    parser.add_argument("--steps", type=int, metavar="N", help="gradient steps, those of zoo_configs by default")
-    parser.add_argument("--episodes", type=int, default=50, metavar="N", help="evaluation episodes, 50 by default")
-    parser.add_argument("--demonstrations", type=int, default=N_DEMONSTRATIONS, metavar="N", help="200 by default")
+    parser.add_argument("--steps", type=at_least(1), metavar="N", help="gradient steps, those of zoo_configs by default")
+    parser.add_argument("--episodes", type=at_least(1), default=50, metavar="N", help="evaluation episodes, 50 by default")
+    parser.add_argument("--demonstrations", type=at_least(2), default=N_DEMONSTRATIONS, metavar="N", help="200 by default")
     options = parser.parse_args(argv)
     run_demo(Path(options.output), options.demonstrations, options.steps, options.episodes)
 

@@ -15,7 +15,7 @@ from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.files import read_run, replacing
 from sb3_dtfm.recording.loading import AgentFiles, find_agent
 from sb3_dtfm.zoo import hub
-from sb3_dtfm.zoo.arguments import import_packages
+from sb3_dtfm.zoo.arguments import at_least, import_packages
 from sb3_dtfm.zoo.commands import FoundModel
 from sb3_dtfm.zoo.registration import register
 from sb3_dtfm.zoo.rendering import RenderingError
@@ -122,9 +122,11 @@ def _parser() -> argparse.ArgumentParser:
     hub.add_repository_arguments(parser)
     argument = parser.add_argument
     argument("-m", "--commit-message", default="Upload of sb3-dtfm", metavar="TEXT", help="of the upload")
-    argument("-n", "--n-timesteps", type=int, default=1000, metavar="N", help="steps of the video, 1000 by default")
+    argument("-n", "--n-timesteps", type=at_least(1), default=1000, metavar="N", help="steps of the video, 1000 by default")
     argument("--no-render", action="store_true", help="no video")
-    argument("--n-eval-episodes", type=int, default=10, metavar="N", help="episodes of the evaluation, 10 by default")
+    argument(
+        "--n-eval-episodes", type=at_least(1), default=10, metavar="N", help="of the evaluation, 10 by default"
+    )
     argument("--seed", type=int, default=0, help="of the evaluation and the video, 0 by default")
     argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="to import for their tasks")
     return parser

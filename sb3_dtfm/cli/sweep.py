@@ -21,7 +21,7 @@ from sb3_dtfm.data import load_dataset
 from sb3_dtfm.envs import ReturnToGoWrapper
 from sb3_dtfm.files import replacing
 from sb3_dtfm.recording.loading import AgentFiles, algorithm_of, find_agent, load_agent
-from sb3_dtfm.zoo.arguments import UsageError, import_packages, key_values
+from sb3_dtfm.zoo.arguments import UsageError, at_least, import_packages, key_values
 
 COLORS = ("#1b6ca8", "#c0562b", "#3f8f5f", "#7b5ea7")
 # First seed of the initial states: apart from those of recordings and benchmarks.
@@ -107,9 +107,9 @@ def _parser() -> argparse.ArgumentParser:
     argument(
         "--returns", nargs="+", type=float, metavar="R", help="target returns; evenly over the dataset's returns by default"
     )
-    argument("--points", type=_at_least(2), default=9, metavar="N", help="how many then; 9 by default")
-    argument("--episodes", type=_at_least(1), default=10, metavar="N", help="for each return; 10 by default")
-    argument("--n-envs", type=_at_least(1), default=10, metavar="N", help="environments side by side; 10 by default")
+    argument("--points", type=at_least(2), default=9, metavar="N", help="how many then; 9 by default")
+    argument("--episodes", type=at_least(1), default=10, metavar="N", help="for each return; 10 by default")
+    argument("--n-envs", type=at_least(1), default=10, metavar="N", help="environments side by side; 10 by default")
     argument("--acting", nargs="+", default=[], metavar="KEY:VALUE", help="for example flow_steps:10; as saved by default")
     argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="to import first: they register tasks")
     argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="as in train")
@@ -134,15 +134,6 @@ def set_acting(model: BaseAlgorithm, choices: dict[str, Any]) -> None:
         model.policy.set_acting(**choices)  # type: ignore[operator]
     except ValueError as error:
         raise UsageError(f"--acting: {error}") from error
-
-
-def _at_least(low: int) -> Any:
-    def number(text: str) -> int:
-        if not text.isdigit() or int(text) < low:
-            raise argparse.ArgumentTypeError(f"{text!r} is no whole number of at least {low}")
-        return int(text)
-
-    return number
 
 
 def evenly(returns: np.ndarray, n: int) -> list[float]:

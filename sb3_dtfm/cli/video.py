@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from sb3_dtfm.zoo.arguments import check_algorithm, check_env_id, import_packages
+from sb3_dtfm.zoo.arguments import at_least, check_algorithm, check_env_id, import_packages
 from sb3_dtfm.zoo.registration import register
 from sb3_dtfm.zoo.video import FORMATS, add_model_arguments, chosen_model, film, models_of_training
 
@@ -52,7 +52,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_model_arguments(parser)
     argument = parser.add_argument
-    argument("-n", "--n-timesteps", type=int, default=1000, metavar="N", help="steps to film, 1000 by default")
+    argument("-n", "--n-timesteps", type=at_least(1), default=1000, metavar="N", help="steps to film, 1000 by default")
     argument(
         "-o", "--output-folder", dest="output", metavar="PATH", help="folder, or .mp4 or .gif file; RUN/videos by default"
     )

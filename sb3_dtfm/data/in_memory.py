@@ -98,11 +98,10 @@ def load_episodes(
         actions out of bounds; names the episode and the step
     """
     source = "episodes"
-    if len(episodes) and isinstance(episodes[0], Mapping):
-        warn_of_made_up_rewards(set(map(str, episodes[0])) - set(observation_keys or ()), source)
-    elif len(episodes) and hasattr(episodes[0], "acts"):
-        warn_of_made_up_rewards((name for name in REWARDS if hasattr(episodes[0], name)), source)
-    read = partial(_trajectory, source=source, keys=observation_keys, observation_space=observation_space)
+    unrewarded: dict[int, set[str]] = {}
+    read = partial(
+        _trajectory, source=source, keys=observation_keys, observation_space=observation_space, unrewarded=unrewarded
+    )
     actions = _some_actions(episodes, action_space, read, source, on_invalid)
     space = bounded_space(action_bounds, action_space, actions, source)
 
@@ -112,9 +111,17 @@ def load_episodes(
 
     numbers = range(len(episodes))
     with explain_range(space, action_bounds, action_space):
-        return TrajectoryBuffer.from_trajectories(
+        buffer = TrajectoryBuffer.from_trajectories(
             map(trajectory, numbers), space, source=source, storage=storage, on_invalid=on_invalid
         )
+    if unrewarded:
+        number, names = next(iter(unrewarded.items()))
+        n_others = len(unrewarded) - 1
+        some = f", episode {number}" + (f" and {n_others} more" if n_others else "")
+        warn_of_made_up_rewards(
+            names - set(observation_keys or ()), source if len(unrewarded) == len(episodes) else f"{source}{some}"
+        )
+    return buffer
 
 
 def _some_actions(
@@ -137,15 +144,22 @@ def _some_actions(
 
 
 def _trajectory(
-    episode: Any, number: int, source: str, keys: Sequence[str] | None, observation_space: spaces.Space | None
+    episode: Any,
+    number: int,
+    source: str,
+    keys: Sequence[str] | None,
+    observation_space: spaces.Space | None,
+    unrewarded: dict[int, set[str]],
 ) -> Trajectory:
-    """An episode of any of the kinds of :func:`load_episodes`."""
+    """An episode of any of the kinds of :func:`load_episodes`; without rewards its names are kept in `unrewarded`."""
     name = f"episode {number}"
     where = f"{source}, {name}"
     if isinstance(episode, Trajectory):
         return episode
     with wrap_dataset_errors(where, NUMBERS_EXPECTED):
         arrays = _arrays_of_episode(episode, where)
+        if not any(key in arrays for key in REWARDS):
+            unrewarded[number] = set(map(str, arrays))
         return _of_arrays(arrays, keys, observation_space, name, where)
 
 

@@ -156,6 +156,17 @@ class Restored(NamedTuple):
                 f"--resume {self.run} --gym-packages {name}."
             )
 
+    def check_upload(self, arguments: Sequence[str]) -> None:
+        """
+        :param arguments: that the run's folder names
+        :raises UsageError: they would upload the run
+        """
+        if any(each.startswith("--trac") for each in arguments):  # argparse takes abbreviations
+            raise UsageError(
+                f"--resume {self.run}: {START} says --track, which uploads the run; repeat the command's other arguments "
+                "beside --resume to upload it."
+            )
+
     def check_config(self, path: str, settings: dict[str, Any] | None = None) -> dict[str, Any]:
         """
         :param path: of settings that the run's folder names
@@ -399,6 +410,21 @@ def _shorthands(options: argparse.Namespace, settings: dict[str, Any]) -> list[t
     return [(option, f"{key}:{value!r}") for option, key, wanted, value in changes if wanted is not None]
 
 
+def at_least(low: int) -> Callable[[str], int]:
+    """
+    The type of an argument that is a whole number.
+
+    :param low: the smallest one that is accepted
+    """
+
+    def number(text: str) -> int:
+        if not text.isdigit() or int(text) < low:
+            raise argparse.ArgumentTypeError(f"{text!r} is no whole number of at least {low}")
+        return int(text)
+
+    return number
+
+
 def enjoy_parser() -> argparse.ArgumentParser:
     """Arguments of `enjoy` that RL-Zoo does not have, or that get a default here."""
     parser = argparse.ArgumentParser(
@@ -414,6 +440,7 @@ def enjoy_parser() -> argparse.ArgumentParser:
     shared("--algo", default="ppo", help=argparse.SUPPRESS)
     shared("--env", help=argparse.SUPPRESS)
     shared("-f", "--folder", help=argparse.SUPPRESS)
+    shared("-n", "--n-timesteps", type=int, help=argparse.SUPPRESS)
     shared("--device", help=argparse.SUPPRESS)
     shared("--gym-packages", nargs="+", default=[], help=argparse.SUPPRESS)
     return parser
@@ -436,8 +463,13 @@ def enjoy_arguments(argv: Sequence[str]) -> tuple[float | None, list[str]]:
     ours = options.algo in (*ALGORITHMS, FINETUNED)
     if options.target_return is not None and not ours:
         raise UsageError(f"--target-return: for --algo {' and '.join(ALGORITHMS)} only, not for {options.algo}.")
+    if options.folder == "":
+        raise UsageError("-f: expected a folder, got ''; . is the current one.")
+    if options.n_timesteps is not None and options.n_timesteps < 1:
+        raise UsageError(f"-n: must be at least 1, got {options.n_timesteps}.")
     folder = options.folder or ("logs" if ours else None)
     with_target_return(options.target_return, None)  # refuses what is none
     given = {"--env": options.env, "--device": options.device, "--folder": folder}
+    given["-n"] = options.n_timesteps and str(options.n_timesteps)
     known = [word for option, value in given.items() if value for word in (option, value)]
     return options.target_return, ["--algo", options.algo, *rest, *known, *_packages(options)]

@@ -91,6 +91,8 @@ def _train(command: str, manager: Any, arguments: Sequence[str], restored: Resto
     script: Any = rl_zoo3.train
     script.ExperimentManager = manager
     script.StoreDict = StoreValues if restored is None else StoreLiterals
+    if restored is not None:
+        restored.check_upload(arguments)
     script.importlib = importlib if restored is None else SimpleNamespace(import_module=restored.check_package)
     _call(script.train, command, arguments)
 

@@ -1,6 +1,7 @@
 """Data in memory: lists of episodes and SB3's replay buffers."""
 
 import itertools
+import warnings
 from collections import namedtuple
 from dataclasses import dataclass
 from typing import Any
@@ -155,6 +156,22 @@ def test_an_unfit_episode_can_be_dropped_and_actions_clipped():
     steps = [(np.zeros(2), np.full(2, 9.0), 1.0, t == 2) for t in range(3)]
     for given in ([{"obs": OBS, "acts": 9 * ACTS}], steps, replay_buffer):
         assert load_dataset(given, clip_actions=True).actions.abs().max() == 1.0
+
+
+def test_made_up_rewards_are_told_of_whatever_lacks_them():
+    """Steps one by one, too, and an episode behind others that have rewards."""
+    step = {"observation": np.zeros(2), "action": np.zeros(1), "terminated": False}
+    steps = [step, {**step, "terminated": True}]
+    rewarded = [{**each, "reward": 1.0} for each in steps]
+    for episodes, where in (
+        ([steps, steps], "^episodes: there is none"),
+        ([rewarded, steps, rewarded, steps], "^episodes, episode 1 and 1 more: there is none"),
+    ):
+        with pytest.warns(UserWarning, match=where):
+            load_dataset(episodes)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_dataset([rewarded, rewarded])
 
 
 def test_rewards_that_are_made_up_although_something_was_there_are_told_of():

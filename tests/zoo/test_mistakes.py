@@ -91,11 +91,32 @@ def test_a_mistake_of_a_conf_file_is_one_line(content, message, workplace, capsy
         (["--device", "evil"], "--device evil: expected auto, cpu, cuda or cuda:N"),
         (["--target-return", "nan"], "--target-return: target_return must be a finite number"),
         (["--env-kwargs", "a:float32"], "text needs quotes of its own: \"a:'float32'\""),
+        (["-n", "0"], "-n: must be at least 1, got 0"),
+        (["-n", "-5"], "-n: must be at least 1, got -5"),
+        (["-f", ""], "-f: expected a folder, got ''; . is the current one"),
     ],
 )
 def test_a_mistake_of_enjoy_is_one_line(arguments, message, workplace, capsys):
     assert main([*ENJOY, *arguments]) == 2
     assert is_one_line(capsys, message)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["push", *ENJOY[1:5], "-orga", "me", "--n-eval-episodes", "0"],
+        ["push", *ENJOY[1:5], "-orga", "me", "-n", "0"],
+        ["video", *ENJOY[1:5], "-n", "0"],
+        ["demo", "--episodes", "0"],
+        ["demo", "--steps", "-1"],
+        ["demo", "--demonstrations", "0"],
+    ],
+)
+def test_numbers_of_nothing_are_refused(command, workplace, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(command)
+    assert f"{command[-1]!r} is no whole number of at least" in capsys.readouterr().err
+    assert not list(Path().iterdir())
 
 
 def test_tasks_of_the_current_folder_are_found(workplace, monkeypatch):

@@ -248,6 +248,7 @@ OF_START = {
     "a search": ([*PACKAGED, "--optimize"], "-optimize"),
     "a module's task": (["--env", f"{PLANTED}:HalfCheetah-v5"], "not found in gym registry"),
     "another algorithm": (["--algo", "ppo"], "none of --algo ppo"),
+    "an upload": (["--trac", "--wandb-entity", "evil"], "says --track, which uploads the run"),
 }
 
 
