@@ -19,9 +19,11 @@ from sb3_dtfm.data.decisions import decide, sentences
 from sb3_dtfm.data.inspection import Inspection, Range, inspect_buffer
 from sb3_dtfm.envs import flatten_observation_space, image_spaces, register_gymnasium_robotics, without_images
 from sb3_dtfm.envs.packages import import_packages
+from sb3_dtfm.files import printable
 
 BLUE, RED, GREY = "#1b6ca8", "#c0562b", "0.6"
 # Options that choose among episodes by what they come to.
+ROBOSUITE = "robosuite/"
 CHOOSING = {"min_return", "best_share", "success_only"}
 # Discrete actions that are counted in the table, the most frequent ones.
 N_CHOICES = 10
@@ -42,14 +44,18 @@ def main(argv: Sequence[str]) -> None:
     dataset = options.dataset[0] if len(options.dataset) == 1 else options.dataset
     buffer = load(dataset, dict(options.dataset_kwargs), options.env, dict(options.env_kwargs))
     found = inspect_buffer(buffer)
-    print("\n".join([*table(buffer, found), *dimensions(found.observations)]))
+    for line in [*table(buffer, found), *dimensions(found.observations)]:
+        print(printable(line))
     for remark in found.remarks:
-        print(f"- {remark}")
+        print(f"- {printable(remark)}")
     print("\nDecided from the data, unless you say otherwise:")
     for sentence in sentences(decide(buffer)):
-        print(f"- {sentence}")
-    print(f"\nTo load it in Python:\n  {loading(dataset, dict(options.dataset_kwargs), options.env)}")
-    print(f"\nTo begin with:\n  {command(options.dataset, options.dataset_kwargs, options.gym_packages, buffer, found)}")
+        print(f"- {printable(sentence)}")
+    print("\nTo load it in Python:")
+    for line in loading(dataset, dict(options.dataset_kwargs), options.env, dict(options.env_kwargs)):
+        print(f"  {printable(line)}")
+    training = command(options.dataset, options.dataset_kwargs, options.gym_packages, buffer, found)
+    print(f"\nTo begin with:\n  {printable(training)}")
     print(f"\nPicture: {draw(buffer, found, Path(options.output), ' + '.join(options.dataset))}")
 
 
@@ -166,18 +172,31 @@ def dimensions(found: Range) -> list[str]:
     return [*lines, f"| {n_more} observations more | |"] if n_more > 0 else lines
 
 
-def loading(dataset: str | list[str], options: dict[str, Any], env_id: str | None) -> str:
+def loading(
+    dataset: str | list[str],
+    options: Mapping[str, Any],
+    env_id: str | None,
+    env_kwargs: Mapping[str, Any] = MappingProxyType({}),
+) -> list[str]:
     """
     :param dataset: as for :func:`load`
     :param options: as for :func:`load`
     :param env_id: as for :func:`load`
-    :return: Python that reads the dataset
+    :param env_kwargs: as for :func:`load`
+    :return: lines of Python, the last of which reads the dataset
     """
-    given = {name: repr(value) for name, value in options.items()}
+    lines, known = [], {}
     if env_id is not None:
-        limit = gym.spec(env_id).max_episode_steps
-        given = {"action_space": f"gymnasium.make({env_id!r}).action_space", "max_episode_steps": repr(limit), **given}
-    return f"sb3_dtfm.data.load_dataset({', '.join([repr(dataset), *map('='.join, given.items())])})"
+        arguments = [repr(env_id), *(f"{name}={value!r}" for name, value in env_kwargs.items())]
+        lines.append(f"env = gymnasium.make({', '.join(arguments)})")
+        known = {
+            "action_space": "env.action_space",
+            "observation_space": "env.observation_space",
+            "max_episode_steps": repr(gym.spec(env_id).max_episode_steps),
+            **({"env_args": "env.unwrapped.env_args"} if env_id.startswith(ROBOSUITE) else {}),
+        }
+    given = {**known, **{name: repr(value) for name, value in options.items()}}
+    return [*lines, f"sb3_dtfm.data.load_dataset({', '.join([repr(dataset), *map('='.join, given.items())])})"]
 
 
 def _images(cameras: Mapping[str, spaces.Box]) -> str:
@@ -222,7 +241,7 @@ def command(
     words = ["sb3-dtfm", "train", "--algo", algo, "--env", buffer.env_id or "TASK"]
     words += ["--dataset", *datasets, "--target-return", f"{found.target_return:g}"]
     words += ["--gym-packages", *gym_packages] if gym_packages else []
-    if buffer.image_spaces and (buffer.env_id or "").startswith("robosuite/"):  # whose cameras are off by default
+    if buffer.image_spaces and (buffer.env_id or "").startswith(ROBOSUITE):  # whose cameras are off by default
         shown = [camera.removesuffix("_image") for camera in buffer.image_spaces]
         size = next(iter(buffer.image_spaces.values())).shape[1]
         words += ["--env-kwargs", f"cameras:{shown}", f"camera_size:{size}"]

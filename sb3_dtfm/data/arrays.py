@@ -5,7 +5,6 @@ import csv
 import math
 import os
 import re
-import warnings
 import zipfile
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -20,6 +19,7 @@ from sb3_dtfm.data.cache import existing_file
 from sb3_dtfm.data.hdf5 import check_within, describe_hdf5, read_hdf5
 from sb3_dtfm.data.observations import as_vectors
 from sb3_dtfm.data.trajectories import DatasetError, check_real, check_size, wrap_dataset_errors
+from sb3_dtfm.files.printing import warn
 
 NPZ_SUFFIX, CSV_SUFFIX, PARQUET_SUFFIX = ".npz", ".csv", ".parquet"
 EXPECTED = "the path of a file of flat arrays (.npz, .hdf5) or of a table (.csv, .parquet)"
@@ -79,7 +79,7 @@ class Arrays(ABC):
                 found = [each for each in self.names if re.match(rf"{name}[\W_\d]", each) and not re.match(following, each)]
                 numbered = [each for each in found if re.fullmatch(rf"{name}[\W_\d]*\d[\W_]*", each)]
                 if unread := sorted(set(found) - set(numbered or found)):
-                    warnings.warn(
+                    warn(
                         f"{self.source}: {', '.join(numbered)} are read, and not {', '.join(unread)}. "
                         "observation_keys=[...] and action_keys=[...] name columns to read.",
                         stacklevel=4,

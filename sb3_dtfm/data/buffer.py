@@ -2,7 +2,6 @@
 
 import copy
 import os
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from sb3_dtfm.data.short_episodes import ShortEpisodes
 from sb3_dtfm.data.storage import FileStorage, MappedSteps, MemoryStorage
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, listed, returns_to_go
 from sb3_dtfm.files import replacing
+from sb3_dtfm.files.printing import warn
 from sb3_dtfm.transitions import Transitions
 from sb3_dtfm.windows import OBSERVATION, map_tensors
 
@@ -84,7 +84,7 @@ class TrajectoryBuffer(FlatSteps):
         self.dropped = dropped
         if dropped:
             n_all = dropped[0] + len(episodes.lengths)
-            warnings.warn(
+            warn(
                 f"{source}: {dropped[0]} of {n_all} episodes have been dropped, the first for this: {dropped[1]}",
                 stacklevel=2,
             )
@@ -230,7 +230,7 @@ class TrajectoryBuffer(FlatSteps):
         longer = np.flatnonzero(self.episode_lengths > max_episode_steps)
         if not len(longer):
             return self
-        warnings.warn(
+        warn(
             f"{self.source}: {len(longer)} of {self.n_episodes} episodes have more than {max_episode_steps} steps, up to "
             f"{self.episode_lengths.max()}. Later steps and their rewards are left out. To keep them, make an environment "
             "with a larger max_episode_steps, or set dataset_kwargs={'max_episode_steps': None}.",
@@ -458,7 +458,7 @@ class TrajectoryBuffer(FlatSteps):
         """
         path = with_npz(path)
         if (self.weights != self.weights[0]).any():
-            warnings.warn(f"{path}: has no weights of episodes; give them again when it is read.", stacklevel=2)
+            warn(f"{path}: has no weights of episodes; give them again when it is read.", stacklevel=2)
         stops = self._stops.cpu().numpy()
         ended = {name: np.zeros(len(self), bool) for name in ("terminations", "truncations")}
         ended["terminations"][stops - 1], ended["truncations"][stops - 1] = self.terminated, self.truncated

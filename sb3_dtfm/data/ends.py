@@ -1,6 +1,5 @@
 """Ends of the episodes that lie one after the other in flat arrays, and what tells of them."""
 
-import warnings
 from collections.abc import Sequence
 from numbers import Real
 from typing import NamedTuple
@@ -9,6 +8,7 @@ import numpy as np
 
 from sb3_dtfm.data.arrays import Arrays
 from sb3_dtfm.data.trajectories import DatasetError, check_flags
+from sb3_dtfm.files.printing import warn
 
 # Names of each array in other libraries' files: the first that is there is read.
 ENDS, LENGTHS = "episode_ends", "episode_lengths"
@@ -75,7 +75,7 @@ def _warn_of_inner_ends(ended: np.ndarray, stops: np.ndarray, arrays: Arrays) ->
         step = first - (stops[episode - 1] if episode else 0)
         flags = " or ".join(arrays.name(names) for names in (TERMINATIONS, TRUNCATIONS, DONES) if arrays.has(names))
         borders = next(arrays.name(names) for names in ((ENDS,), (LENGTHS,), EPISODES) if arrays.has(names))
-        warnings.warn(
+        warn(
             f"{arrays.source}: {flags}: {inner.sum()} steps inside episodes are flagged as ends, first step {step} of "
             f"episode {episode}. Episodes end where {borders} says; leave {borders} out if they end earlier.",
             stacklevel=2,
@@ -86,7 +86,7 @@ def _cut(stops: np.ndarray, max_episode_steps: int | None, arrays: Arrays) -> np
     """Ends of episodes of which only terminations tell: those that ran out of time are joined to the next ones."""
     told = f"{arrays.source}: {arrays.name(TERMINATIONS)} tell of terminal states, and nothing tells of time-outs"
     if max_episode_steps is None:
-        warnings.warn(
+        warn(
             f"{told}: an episode that ran out of time is joined to the next one. max_episode_steps=... cuts there, and "
             f"{ENDS}, {EPISODES[0]} or {TRUNCATIONS[1]} would tell.",
             stacklevel=2,
@@ -97,7 +97,7 @@ def _cut(stops: np.ndarray, max_episode_steps: int | None, arrays: Arrays) -> np
               zip(starts, stops, strict=True)]  # fmt: skip
     longer = sum(len(piece) > 1 for piece in pieces)
     if longer:
-        warnings.warn(
+        warn(
             f"{told}: {longer} episodes of more than max_episode_steps={max_episode_steps} are cut after as many steps.",
             stacklevel=2,
         )

@@ -3,7 +3,6 @@
 import contextlib
 import itertools
 import os
-import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -24,6 +23,7 @@ from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import ActionRangeError, DatasetError, Trajectory
 from sb3_dtfm.envs.return_to_go import CHANNELS, IMAGE
 from sb3_dtfm.envs.success import SUCCESS
+from sb3_dtfm.files.printing import warn
 
 # Names of each array in other libraries' files: the first that is there is read.
 OBSERVATIONS = ("observations", "observation", "obs", "states", "state")
@@ -59,7 +59,7 @@ def warn_of_made_up_rewards(
         "so that a success is rewarded" if told else "nor any success, so that every episode counts as a success, rewarded"
     )
     not_read = f" Not read: {', '.join(unread)}." if unread else ""
-    warnings.warn(f"{source}: {missing}, {counts} by 1 at its last step.{not_read}", stacklevel=2)
+    warn(f"{source}: {missing}, {counts} by 1 at its last step.{not_read}", stacklevel=2)
 
 
 def is_flat_file(dataset: Any) -> bool:
@@ -181,7 +181,7 @@ def _warn_of_images(arrays: Arrays, others: Collection[str], n_steps: int) -> No
     for name in sorted(set(arrays.names) - set(others), key=str):
         shape, dtype = arrays.describe(name) or ((), None)
         if dtype == np.uint8 and len(shape) == 4 and shape[0] == n_steps and {shape[1], shape[3]} & set(CHANNELS):
-            warnings.warn(
+            warn(
                 f"{arrays.source}: {name} has an image of shape {shape[1:]} for each step, and is not read. Call it "
                 f"{STORED_IMAGE}{name}, or name it in observation_keys=[...].",
                 stacklevel=4,

@@ -1,7 +1,6 @@
 """Reading what is already in memory into a `TrajectoryBuffer`: lists of episodes, and SB3's replay buffers."""
 
 import itertools
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -32,6 +31,7 @@ from sb3_dtfm.data.steps import SHORT_STEP, STEP, arrays_of_steps, is_episodes, 
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_space, wrap_dataset_errors
 from sb3_dtfm.envs.success import reported_success
+from sb3_dtfm.files.printing import warn
 
 
 def load_steps(
@@ -307,7 +307,7 @@ def load_replay_buffer(
     if unfinished:  # their returns are those of their first steps alone
         n_unfinished = sum(stop - start for _, start, stop in unfinished)
         fate = "are left out" if pieces else "are all that there is"
-        warnings.warn(
+        warn(
             f"{source}: {len(unfinished)} unfinished episodes with {n_unfinished} steps {fate}; another learn(), or the "
             "buffer's end, cut them off.",
             stacklevel=3,

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from sb3_dtfm.data.flat import bounded_space, fitted, json_options, warn_of_made
 from sb3_dtfm.data.lerobot_images import DATA, EPISODE, FRAME, IMAGE, INFO, TIME, VIDEO, Cameras, Columns
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_flags, wrap_dataset_errors
+from sb3_dtfm.files.printing import warn
 
 ACTION, REWARDS, SUCCESS, DONE = "action", ("next.reward", "reward"), "next.success", "next.done"
 OBSERVATION = "observation."
@@ -178,7 +178,7 @@ def _names(
         f"{name} ({dtype})" for name, dtype in features.items() if name.startswith(OBSERVATION) and name not in offered
     ]
     if keys is None and unread:
-        warnings.warn(f"{source}: neither vectors nor images, and not read: {', '.join(unread)}.", stacklevel=3)
+        warn(f"{source}: neither vectors nor images, and not read: {', '.join(unread)}.", stacklevel=3)
     # The environment shows its entries in the order of their names.
     names = dict(sorted(chosen.items())) if isinstance(chosen, Mapping) else {name: name for name in chosen}
     for name in names.values():

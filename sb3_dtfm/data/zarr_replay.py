@@ -5,7 +5,6 @@ import json
 import math
 import os
 import re
-import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -34,6 +33,7 @@ from sb3_dtfm.data.flat import (
 from sb3_dtfm.data.observations import observed
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_flags, check_size, wrap_dataset_errors
+from sb3_dtfm.files.printing import warn
 
 SUFFIXES = (".zarr", ".zarr.zip")
 EXPECTED = "the path of a zarr replay buffer (.zarr, .zarr.zip)"
@@ -255,9 +255,7 @@ def _warn_of_missing_chunks(data: Mapping[str, Any], names: Sequence[str], sourc
             n_stored = data[name].nchunks_initialized if n_chunks <= MOST_COUNTED else n_chunks
         if n_stored < n_chunks:
             missing = f"{n_chunks - n_stored} of {n_chunks} chunks are not stored, and count as {data[name].fill_value}"
-            warnings.warn(
-                f"{source}: {name}: {missing}. If other numbers were there, the dataset is incomplete.", stacklevel=3
-            )
+            warn(f"{source}: {name}: {missing}. If other numbers were there, the dataset is incomplete.", stacklevel=3)
 
 
 def _ended(data: Mapping[str, Any], names: Sequence[str], steps: slice, where: str) -> bool:
@@ -295,7 +293,7 @@ def _chosen(
             raise DatasetError(f"{source}: data has nothing to observe, only {', '.join(sorted(data))}.")
         if images and vector is None and others:
             unread = ", ".join(sorted(others - shown)) or "none"
-            warnings.warn(
+            warn(
                 f"{source}: observed: {', '.join(keys)}; not observed: {unread}. observation_keys=[...] chooses.",
                 stacklevel=3,
             )

@@ -11,7 +11,7 @@ from sb3_dtfm.files.model import (
     write_model,
 )
 from sb3_dtfm.files.onnx import write_onnx
-from sb3_dtfm.files.printing import printable
+from sb3_dtfm.files.printing import printable, warn
 from sb3_dtfm.files.replacing import find_leftovers, hidden_name, replacing
 from sb3_dtfm.files.run import CLASSES, EVALUATED, check_settings, literal, read_run, settings_loader
 
@@ -33,6 +33,7 @@ __all__ = [
     "read_run",
     "replacing",
     "settings_loader",
+    "warn",
     "write_model",
     "write_onnx",
 ]

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from sb3_dtfm.data import ReturnReference
 from sb3_dtfm.envs.success import reported_success
-from sb3_dtfm.files import read_run
+from sb3_dtfm.files import printable, read_run
 
 # Below this share of the goal, suggestions are printed.
 ENOUGH = 0.9
@@ -130,7 +130,7 @@ def compare(
             dataset = read_run(run / env_name).get("dataset")
             arguments = f"--env {env_name.gym_id} --dataset {dataset if isinstance(dataset, str) else 'DATASET'}"
             sentences.append(f"A sweep shows the best target return: sb3-dtfm sweep {run} {arguments}")
-    return sentences
+    return list(map(printable, sentences))
 
 
 def four_digits(number: float) -> str:

@@ -10,7 +10,7 @@ from PIL import Image
 
 import sb3_dtfm
 from sb3_dtfm.cli.main import main
-from sb3_dtfm.data import load_dataset
+from sb3_dtfm.data import TrajectoryBuffer, load_dataset
 from sb3_dtfm.data.inspection import inspect_buffer
 from sb3_dtfm.zoo.arguments import train_arguments
 from tests.recorded import DATASET_ID
@@ -126,6 +126,52 @@ def test_what_lies_behind_the_task_s_time_limit_is_not_counted(workplace, capsys
     assert "an episode has 250 to 250" in capsys.readouterr().out
 
 
+def loaded(text: str) -> TrajectoryBuffer:
+    """Read the dataset by the lines that are printed."""
+    *before, last = text.split("To load it in Python:\n")[1].split("\n\n")[0].splitlines()
+    names = {"gymnasium": gymnasium, "sb3_dtfm": sb3_dtfm}
+    exec("\n".join(line.strip() for line in before), names)
+    return eval(last.strip(), names)
+
+
+class Floors(gymnasium.Env):
+    """A Dict with a Discrete part, and a size that is an argument."""
+
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+    def __init__(self, n_floors: int = 2) -> None:
+        parts = {"floor": gymnasium.spaces.Discrete(n_floors), "speed": gymnasium.spaces.Box(-9.0, 9.0, (2,))}
+        self.observation_space = gymnasium.spaces.Dict(parts)
+
+
+def test_the_lines_that_load_know_the_environments_spaces(workplace, capsys):
+    if "Floors-v0" not in gymnasium.registry:
+        gymnasium.register("Floors-v0", Floors, max_episode_steps=7)
+    rng = np.random.default_rng(0)
+    arrays = {
+        "floor": rng.integers(0, 3, 20),
+        "speed": rng.normal(size=(20, 2)),
+        "action": rng.uniform(-1, 1, (20, 1)),
+    }
+    np.savez("floors.npz", reward=np.ones(20), done=np.arange(20) % 5 == 4, **arrays)
+    keys = ["--dataset-kwargs", "observation_keys:['floor','speed']"]
+    assert main(["inspect", "floors.npz", "--env", "Floors-v0", "--env-kwargs", "n_floors:3", *keys]) == 0
+    assert loaded(capsys.readouterr().out).observation_space.shape == (5,)
+
+
+def test_a_file_controls_no_terminal(workplace, capsys, recwarn):
+    """Neither by its arrays' names nor by what they say."""
+    arrays = {**pendulum_arrays(), "action": pendulum_arrays()["action"] / 2, "env_id": np.array("A\x1b[2J-v0")}
+    del arrays["reward"]
+    np.savez("evil.npz", **arrays, **{"\x1b[31mred": np.zeros(20), "images/\x1bcamera": np.zeros((20, 8, 8, 3), np.uint8)})
+    assert main(["inspect", "evil.npz"]) == 0
+    shown = [capsys.readouterr().out, *(str(each.message) for each in recwarn)]
+    assert any("\\x1b[2J" in text for text in shown)
+    assert any("\\x1b[31mred" in text for text in shown)
+    assert any("\\x1bcamera" in text for text in shown)
+    assert not any("\x1b" in text for text in shown)
+
+
 def pendulum_arrays():
     rng = np.random.default_rng(0)
     n = 20
@@ -146,15 +192,14 @@ def test_the_environment_tells_of_the_range_of_actions(workplace, capsys):
     low, high = (getattr(pendulum_arrays()["obs"][:, 1], name)() for name in ("min", "max"))
     assert f"| observation 1 | {low:.4g} to {high:.4g}, " in text
     assert "--env Pendulum-v1 --dataset swings.npz" in text
-    loading = text.split("To load it in Python:\n")[1].splitlines()[0]
-    buffer = eval(loading, {"gymnasium": gymnasium, "sb3_dtfm": sb3_dtfm})
+    buffer = loaded(text)
     assert (buffer.action_space.high[0], buffer.n_episodes) == (2.0, 4)
     shorter = ["--dataset-kwargs", "max_episode_steps:3"]
     with pytest.warns(UserWarning, match="4 of 4 episodes have more than 3 steps"):
         assert main(["inspect", "swings.npz", "--env", "Pendulum-v1", *shorter]) == 0
-    loading = capsys.readouterr().out.split("To load it in Python:\n")[1].splitlines()[0]
+    text = capsys.readouterr().out
     with pytest.warns(UserWarning, match="4 of 4 episodes have more than 3 steps"):
-        assert len(eval(loading, {"gymnasium": gymnasium, "sb3_dtfm": sb3_dtfm})) == 12
+        assert len(loaded(text)) == 12
 
 
 def test_a_task_of_another_package_is_found(workplace, capsys):

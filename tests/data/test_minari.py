@@ -352,8 +352,14 @@ def test_damaged_images_are_named():
         frames = list(file["episode_0/observations/hand"])
         larger = io.BytesIO()
         Image.fromarray(np.zeros((50, 48, 3), np.uint8)).save(larger, "JPEG")
+        others = {kind: io.BytesIO() for kind in ("GIF", "TIFF", "BMP")}
+        for kind, content in others.items():
+            Image.fromarray(np.zeros((40, 48, 3), np.uint8)).save(content, kind)
     for damage, message in {
-        b"no image": "episode 0: hand, step 2: cannot be read .*; the image is no JPEG or PNG, or damaged",
+        **dict.fromkeys(
+            (b"no image", *(content.getvalue() for content in others.values())),
+            "episode 0: hand, step 2: cannot be read .*; the image is no JPEG or PNG, or damaged",
+        ),
         bytes(frames[2])[:200]: "episode 0: hand, step 2: cannot be read .*(?i:truncated)",
         larger.getvalue(): r"episode 0: hand, step 2: the image is RGB of 50 x 48 pixels, expected \(40, 48, 3\)",
     }.items():
