@@ -1,4 +1,4 @@
-"""What SB3's `EvalCallback` writes."""
+"""Evaluations of a run, as SB3's `EvalCallback` writes them."""
 
 from pathlib import Path
 
