@@ -38,7 +38,7 @@ WRAPPERS = ("TimeLimit", "Monitor", "ReturnToGoWrapper")
 # In `info` after several actions: what was observed between them.
 BETWEEN = "observations_between"
 # Episodes in a row without an end, after which a warning says so.
-MOST_UNFINISHED = 10
+MOST_UNFINISHED = 100
 
 
 def image_spaces(space: spaces.Space) -> dict[str, spaces.Box]:
@@ -203,8 +203,8 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     several steps does so in each of many parallel environments at its own place in its episode.
 
     An episode that a wrapper between this one and a `Monitor` ends, such as a `TimeLimit`, has the `info["episode"]` that
-    the Monitor would have given: SB3's evaluations wait for it. They wait for ever for episodes that a wrapper outside of
-    this one ends; a warning tells of ten in a row.
+    the Monitor would have given, for which SB3's evaluations wait; the first one does not if it was terminated, which may be
+    the loss of a life. Evaluations wait for ever for episodes that a wrapper outside of this one ends: a warning says so.
 
     A task that tells of success by another name, as Adroit's hands do, tells it as `is_success` too, which SB3's
     `EvalCallback` and logs know.
@@ -228,7 +228,8 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._episode_target = self._return_to_go = math.nan
         self._timestep = 0
         self._ended = False
-        self._n_unfinished = 0  # episodes in a row
+        self._ends_between = False  # whether a wrapper between this one and the Monitor terminates episodes
+        self._n_unfinished = 0  # episodes since the last end, or the first one
 
     @property
     def known_task(self) -> Task | None:
@@ -267,7 +268,10 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                 "model.set_env(env), or write ReturnToGoWrapper(env, target_return=model.target_return)."
             )
         self._count_unfinished()
+        unseen = self._ended and self._monitor is not None and not self._monitor.needs_reset
         observation, info = self.env.reset(seed=seed, options=options)
+        if unseen and not self._monitor.rewards:  # a lost life resets nothing
+            self._ends_between = True
         self._ended = False
         self._episode_target = self._return_to_go = self.target_return
         self._timestep = 0
@@ -283,7 +287,8 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if success is not None and "is_success" not in info:  # by which SB3 counts
             info = {**info, "is_success": success}
         self._ended = terminated or truncated
-        if self._ended and self._monitor is not None and "episode" not in info:
+        counts = truncated if not terminated else self._ends_between
+        if counts and self._monitor is not None and "episode" not in info:
             total, seconds = round(sum(self._monitor.rewards), 6), round(time.time() - self._monitor.t_start, 6)
             info = {**info, "episode": {"r": total, "l": len(self._monitor.rewards), "t": seconds}}
         return self._observe(observation), reward, terminated, truncated, info

@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_dtfm.benchmark import provenance
-from sb3_dtfm.benchmark.rows import Row, read_rows, write_row
+from sb3_dtfm.benchmark.rows import Row, RowError, RunKey, read_rows, write_row
 from sb3_dtfm.envs.seeding import warn_of_seeds
 from sb3_dtfm.envs.success import reported_success
 from sb3_dtfm.files import replacing
@@ -27,6 +27,7 @@ FINAL_STATES = 2_000_000
 PROGRESS = re.compile(r"step (\d+) of (\d+): (.*)\n")
 PROGRESS_INTERVAL = 0.5  # seconds
 TIMED_BLOCKS, TIMED_ACTIONS = 8, 16
+FIRST_KEY = '{"task"'  # with which a line of rows begins
 N_RANDOM_EPISODES = 10  # whose mean return scores 0
 
 
@@ -181,8 +182,8 @@ class EvaluationCallback(BaseCallback):
     :param n_final_episodes: episodes of the last one, on the other initial states
     :param n_envs: environments side by side
     :param subprocesses: each in a process of its own
-    :ivar after_step: called after each step of an evaluation; an exception of it ends the evaluation, which a resumed run
-        repeats
+    :ivar on_evaluation_step: called after each step of an evaluation but the first two; an exception of it ends the
+        evaluation, which a resumed run repeats
     """
 
     def __init__(
@@ -203,7 +204,8 @@ class EvaluationCallback(BaseCallback):
         self.n_final_episodes = n_final_episodes
         self.n_envs = n_envs
         self.subprocesses = subprocesses
-        self.after_step: Callable[[], None] = lambda: None
+        self.on_evaluation_step: Callable[[], None] = lambda: None
+        self._is_timed = False
         self._resumed, self._training_seconds, self._reported = 0.0, 0.0, 0.0
 
     def _init_callback(self) -> None:
@@ -213,21 +215,39 @@ class EvaluationCallback(BaseCallback):
     def _on_training_start(self) -> None:
         self._resumed = time.perf_counter()
         if self.num_timesteps == 0:
-            if self.rows.exists():  # of an attempt that was killed before its first checkpoint
-                read_rows(self.rows, torn_end=True)  # and nothing else
-                self.rows.unlink()
+            self._own_rows()  # of an attempt that was killed before its first checkpoint, and nothing else
+            self.rows.unlink(missing_ok=True)
             self._evaluate(final=False)
         else:
             self._evaluate_missing(self._restore_rows())
 
     def _restore_rows(self) -> list[Row]:
         """Keep an interrupted run's rows up to its checkpoint; steps behind the last row took as long as those before it."""
-        rows = [row for row in read_rows(self.rows, torn_end=True) if row["step"] <= self.num_timesteps]
+        rows = [row for row in self._own_rows() if row["step"] <= self.num_timesteps]
         with replacing(self.rows) as beside:
             for row in rows:
                 write_row(beside, row)
         timed = next((row for row in reversed(rows) if row["step"] > 0), None)
+        self._is_timed = timed is not None
         self._training_seconds = timed["wall_s"] * self.num_timesteps / timed["step"] if timed else 0.0
+        return rows
+
+    def _own_rows(self) -> list[Row]:
+        """
+        The rows that are there.
+
+        :raises RowError: something else is there
+        """
+        if not self.rows.exists():
+            return []
+        if not self.rows.is_file():
+            raise RowError(f"{self.rows}: is no file; expected rows of this run.")
+        rows = read_rows(self.rows, torn_end=True)
+        torn = not rows and self.rows.stat().st_size > 0
+        with self.rows.open(errors="replace") as file:
+            begins_as_row = file.read(len(FIRST_KEY)) == FIRST_KEY
+        if any(RunKey.of(row) != RunKey.of(self.row) for row in rows) or (torn and not begins_as_row):
+            raise RowError(f"{self.rows}: holds something else; expected rows of this run.")
         return rows
 
     def _on_step(self) -> bool:
@@ -254,7 +274,8 @@ class EvaluationCallback(BaseCallback):
         seeds = range(first, first + n_episodes)
 
         def after_step(n_done: int) -> None:
-            self.after_step()
+            if self._is_timed:  # or a resumed run would not know how long its steps took
+                self.on_evaluation_step()
             self._report(f"{what} {n_done}/{n_episodes}")
 
         episodes = evaluate(self.model, self.vec_env, seeds, after_step)
@@ -274,6 +295,7 @@ class EvaluationCallback(BaseCallback):
             if episodes.successes is None:
                 evaluation["data"] = {**self.row["data"], "random_return": self._random_return()}
         write_row(self.rows, {**self.row, **evaluation})
+        self._is_timed = self.num_timesteps > 0
         self._resumed = time.perf_counter()
 
     def _random_return(self) -> float:

@@ -22,8 +22,8 @@ from sb3_dtfm.envs.packages import import_packages
 from sb3_dtfm.files import printable
 
 BLUE, RED, GREY = "#1b6ca8", "#c0562b", "0.6"
+ROBOSUITE = "robosuite/"  # begins the ids of its tasks
 # Options that choose among episodes by what they come to.
-ROBOSUITE = "robosuite/"
 CHOOSING = {"min_return", "best_share", "success_only"}
 # Discrete actions that are counted in the table, the most frequent ones.
 N_CHOICES = 10
@@ -192,7 +192,7 @@ def loading(
         known = {
             "action_space": "env.action_space",
             "observation_space": "env.observation_space",
-            "max_episode_steps": repr(gym.spec(env_id).max_episode_steps),
+            "max_episode_steps": repr(env_kwargs.get("max_episode_steps", gym.spec(env_id).max_episode_steps)),
             **({"env_args": "env.unwrapped.env_args"} if env_id.startswith(ROBOSUITE) else {}),
         }
     given = {**known, **{name: repr(value) for name, value in options.items()}}

@@ -14,6 +14,8 @@ from sb3_dtfm.data.trajectories import DatasetError, check_real, check_size, wra
 
 # Links one after the other that are followed at most, which is HDF5's own limit.
 MOST_LINKS = 16
+# Names in a list, and bytes of a name, at most.
+MOST_NAMES, LONGEST_NAME = 1_000_000, 255
 CHECKSUM = 4  # bytes that Fletcher's filter adds to a chunk
 # Names of filters that unpack without an error what is cut off.
 UNKNOWN_LENGTH = {h5py.h5z.FILTER_SZIP: "szip", h5py.h5z.FILTER_NBIT: "nbit", h5py.h5z.FILTER_SCALEOFFSET: "scaleoffset"}
@@ -81,9 +83,16 @@ def read_names(group: h5py.Group, name: str, where: str) -> list[str]:
     data, shape, dtype, n_stored = _opened(group, name, where)
     if dtype.kind != "S" and h5py.check_string_dtype(dtype) is None:
         raise DatasetError(f"{what} hold {dtype}; names are expected.")
+    if shape is None or len(shape) != 1 or shape[0] > MOST_NAMES:
+        raise DatasetError(f"{what} have shape {shape}; a list of at most {MOST_NAMES:,} names is expected.")
     _check_stored(data, shape, dtype, n_stored, what)
+    names = []
     with wrap_dataset_errors(what):
-        return [each.decode() for each in np.asarray(h5py.Dataset(data)[()]).reshape(-1).tolist()]
+        for each in h5py.Dataset(data):  # one by one: a small file can name one long text many times
+            if len(each) > LONGEST_NAME:
+                raise DatasetError(f"{what} hold a text of {len(each):,} bytes; names are expected.")
+            names.append(each.decode())
+    return names
 
 
 def _opened(group: h5py.Group, name: str, where: str) -> tuple[h5py.h5d.DatasetID, tuple[int, ...], np.dtype, int]:

@@ -25,6 +25,8 @@ def read_evaluations(path: Path) -> dict[str, np.ndarray]:
         numbers = all(array.dtype.kind in "biuf" for array in (timesteps, results, successes))
         if not fits or not numbers or successes.shape != results.shape:
             raise ValueError("arrays of other shapes or types")
+    except (PermissionError, MemoryError):
+        raise
     except Exception as error:  # a damaged archive can raise anything
         raise ValueError(
             f"{path} is damaged, or no file of SB3's EvalCallback ({type(error).__name__}); expected the arrays timesteps "

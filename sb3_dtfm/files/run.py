@@ -4,6 +4,7 @@ import ast
 import contextlib
 import functools
 import importlib
+import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -23,7 +24,6 @@ EVALUATED = ("normalize", "policy_kwargs", "replay_buffer_class", "replay_buffer
 # Those of both that matter to whoever acts with a model.
 OF_ACTING = ("env_wrapper", "vec_env_wrapper", "normalize")
 ENV_KWARGS = ("env_kwargs", "eval_env_kwargs")
-TASKS = ("task", "env", "env_id")
 
 
 def read_run(run: Path) -> dict[str, Any]:
@@ -106,10 +106,8 @@ def check_settings(settings: Mapping[str, Any], where: str, names: Sequence[str]
     settings = dict(settings)
     for name in (name for name in names if settings.get(name) is not None):
         if name in CLASSES:
-            listed = settings[name] if isinstance(settings[name], list) else [settings[name]]
-            for each in listed:
-                _check_class(next(iter(each), None) if isinstance(each, dict) else each, name, where)
-                _check_nested(each, f"{where}: {name}")
+            for each in settings[name] if isinstance(settings[name], list) else [settings[name]]:
+                _check_class(each, name, where)
         elif isinstance(settings[name], str):
             try:
                 settings[name] = literal(settings[name])
@@ -119,23 +117,41 @@ def check_settings(settings: Mapping[str, Any], where: str, names: Sequence[str]
         kwargs = settings.get(name) or {}
         if not isinstance(kwargs, dict) or not all(isinstance(key, str) and key.isidentifier() for key in kwargs):
             raise ValueError(f"{where}: {name} must map names of arguments to values, found {kwargs!r}.")
-    if "allow_pickle" in (settings.get("dataset_kwargs") or {}):
+    dataset_kwargs = settings.get("dataset_kwargs") or {}
+    if not isinstance(dataset_kwargs, dict):
+        raise ValueError(f"{where}: dataset_kwargs must map names of arguments to values, found {dataset_kwargs!r}.")
+    if "allow_pickle" in dataset_kwargs:
         raise ValueError(f"{where}: dataset_kwargs: allow_pickle is given on the command line or not at all.")
     return settings
 
 
-def _check_nested(value: Any, where: str) -> None:
-    """Check settings among a class's arguments, from which it may make environments, as the benchmark's evaluations do."""
+def _check_nested(value: Any, where: str, seen: set[int]) -> None:
+    """
+    Check settings among a class's arguments, as the benchmark's evaluations have them.
+
+    :param seen: ids of what has been looked at, since YAML may name it again
+    """
+    if id(value) in seen or not isinstance(value, dict | list | tuple):
+        return
+    seen.add(id(value))
     if isinstance(value, dict):
         check_settings(value, where, OF_ACTING)
-        for task in (value.get(key) for key in TASKS):
-            if isinstance(task, str) and ":" in task:  # whose module Gymnasium would import
-                raise ValueError(f"{where}: expected the id of a registered task, found {task!r}.")
-    for each in value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ():
-        _check_nested(each, where)
+        task = value.get("env_id", value.get("task"))
+        if isinstance(task, str) and re.fullmatch(r"[\w.]+:\S+", task):  # whose module Gymnasium would import
+            raise ValueError(f"{where}: expected the id of a registered task, found {task!r}.")
+    for each in value.values() if isinstance(value, dict) else value:
+        _check_nested(each, where, seen)
 
 
-def _check_class(named: Any, name: str, where: str) -> None:
+def _check_class(found: Any, name: str, where: str) -> None:
+    """Check one class, or one with its arguments."""
+    named = next(iter(found), None) if isinstance(found, dict) else found
+    _check_name(named, name, where)
+    if isinstance(named, str) and named.startswith("sb3_dtfm."):  # which may make environments of its arguments
+        _check_nested(found, f"{where}: {name}", set())
+
+
+def _check_name(named: Any, name: str, where: str) -> None:
     module = named.rpartition(".")[0] if isinstance(named, str) else ""
     if name == "policy" and not module:
         return  # an alias, as "MlpPolicy"

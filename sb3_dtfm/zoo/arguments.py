@@ -1,6 +1,7 @@
 """Arguments of `sb3-dtfm train` and `enjoy` beside RL-Zoo's own, written in terms of those."""
 
 import argparse
+import contextlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -418,9 +419,10 @@ def at_least(low: int) -> Callable[[str], int]:
     """
 
     def number(text: str) -> int:
-        if not text.isdigit() or int(text) < low:
-            raise argparse.ArgumentTypeError(f"{text!r} is no whole number of at least {low}")
-        return int(text)
+        with contextlib.suppress(ValueError):
+            if (found := int(text)) >= low:
+                return found
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number of at least {low}")
 
     return number
 

@@ -272,8 +272,8 @@ class OfflineExperimentManager(ExperimentManager):
             for evaluation in evaluations:
                 self.signals.watch(evaluation)
             for callback in self.callbacks:
-                if hasattr(callback, "after_step"):  # an evaluation of another kind, as the benchmark's
-                    callback.after_step = self.signals.end_evaluation
+                if hasattr(callback, "on_evaluation_step"):  # as the benchmark's
+                    callback.on_evaluation_step = self.signals.end_evaluation
         self.keeper = KeepCheckpoint(Path(self.save_path), self.signals, self.start)
         self.callbacks += [EvaluateAtStartAndEnd(evaluations), ReplaceEvaluations(evaluations), self.keeper]
 

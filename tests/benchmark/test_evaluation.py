@@ -1,6 +1,7 @@
 """Evaluation counts each initial state once, whatever the number of environments and the lengths of episodes."""
 
 import contextlib
+import json
 import time
 import warnings
 from typing import Any
@@ -145,7 +146,7 @@ def test_rows_come_before_during_and_after_training_and_at_the_end_on_other_stat
     tmp_path, row, cheetah_buffer, capsys
 ):
     file = tmp_path / "rows.jsonl"
-    write_row(file, make_row(step=5))  # of an attempt that was killed before its first checkpoint
+    write_row(file, make_row(**{**row, "step": 5}))  # of an attempt that was killed before its first checkpoint
     model = make_model(cheetah_buffer)
     model.learn(7, EvaluationCallback(str(file), row, eval_freq=3, n_episodes=2, n_final_episodes=4, n_envs=2))
     rows = read_rows(file)
@@ -191,24 +192,25 @@ def test_an_interrupted_evaluation_is_repeated(tmp_path, row, cheetah_buffer):
             if callback.num_timesteps == end_at:
                 raise EndedError
 
-        callback.after_step = after_step
+        callback.on_evaluation_step = after_step
         with contextlib.suppress(EndedError):
             model.learn(steps, callback, reset_num_timesteps=model.num_timesteps == 0)
         return [(each["step"], each["final"]) for each in read_rows(tmp_path / "rows.jsonl")]
 
     model = make_model(cheetah_buffer)
-    assert run(model, 4, end_at=2) == [(0, False)]
-    assert run(model, 2, end_at=4) == [(0, False), (2, False)]
-    assert run(model, 0) == [(0, False), (2, False), (4, False), (4, True)]
+    assert run(model, 6, end_at=4) == [(0, False), (2, False)]
+    assert run(model, 2, end_at=6) == [(0, False), (2, False), (4, False)]
+    assert run(model, 0) == [(0, False), (2, False), (4, False), (6, False), (6, True)]
 
 
-def test_another_file_is_not_taken_for_rows(tmp_path, row, cheetah_buffer):
+@pytest.mark.parametrize("content", ["mine\n", "mine", json.dumps(make_row()) + "\n"], ids=["text", "a line", "other rows"])
+def test_another_file_is_not_taken_for_rows(content, tmp_path, row, cheetah_buffer):
     other = tmp_path / "other.txt"
-    other.write_text("mine\n")
+    other.write_text(content)
     callback = EvaluationCallback(str(other), row, eval_freq=2, n_episodes=1, n_final_episodes=1)
-    with pytest.raises(RowError, match=r"other.txt, line 1: is not JSON"):
+    with pytest.raises(RowError, match=r"other\.txt.*expected"):
         make_model(cheetah_buffer).learn(1, callback)
-    assert other.read_text() == "mine\n"
+    assert other.read_text() == content
 
 
 def test_evaluating_changes_no_training(tmp_path, row, cheetah_buffer):

@@ -315,6 +315,30 @@ def test_an_end_outside_the_monitor_is_told_whichever_it_is():
     assert evaluate_policy(model, env, 2, return_episode_rewards=True)[1] == [3, 3]
 
 
+class Lives(gym.Wrapper):
+    """Terminates at each third step, and resets the game after the ninth alone, as SB3's EpisodicLifeEnv does."""
+
+    def reset(self, **kwargs):
+        if getattr(self, "n_steps", 9) == 9:
+            self.n_steps = 0
+            return self.env.reset(**kwargs)
+        self.n_steps += 1
+        return self.env.step(np.zeros(2))[0], {}
+
+    def step(self, action):
+        self.n_steps += 1
+        observation, reward, _, _, info = self.env.step(action)
+        return observation, reward, self.n_steps % 3 == 0, False, info
+
+
+def test_a_lost_life_is_no_end_of_the_game():
+    game = TimeLimit(bare_env(), 9)
+    env = DummyVecEnv([lambda: ReturnToGoWrapper(Lives(Monitor(game)), 1.0)])
+    env.reset()
+    told = [info["episode"]["l"] for _ in range(14) for info in env.step(np.zeros((1, 2)))[3] if "episode" in info]
+    assert told == [9, 9]
+
+
 def test_ends_that_no_monitor_sees_are_warned_of():
     for wrapped, n_warnings in [
         (EndAfterThree(ReturnToGoWrapper(Monitor(bare_env()), 1.0)), 1),
@@ -325,7 +349,7 @@ def test_ends_that_no_monitor_sees_are_warned_of():
         env.reset()
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            for _ in range(60):
+            for _ in range(400):
                 env.step(np.zeros((1, 2)))
         told = [str(each.message) for each in caught if "ReturnToGoWrapper(ItsWrapper(env))" in str(each.message)]
         assert len(told) == n_warnings

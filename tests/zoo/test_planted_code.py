@@ -69,6 +69,7 @@ OF_YAML = {
     "name of an argument": ("config.yml", "env_kwargs: {\"a:__import__('os').mkdir('ran')#\": 1}\n"),
     "name in args.yml": ("args.yml", "env_kwargs: {\"a:__import__('os').mkdir('ran')#\": 1}\n"),
     "pickled dataset": ("config.yml", "dataset_kwargs: {allow_pickle: true}\n"),
+    "a circle": ("config.yml", "env_wrapper: [{sb3_dtfm.envs.ReturnToGoWrapper: &a {b: *a, env_wrapper: [os.mkdir]}}]\n"),
     "no YAML": ("config.yml", "a: [\n"),
     "no mapping": ("config.yml", "- a\n"),
     "no text": ("config.yml", "\xff\x00"),

@@ -13,7 +13,7 @@ from sb3_dtfm.benchmark.rows import BASELINES, RunKey
 
 # The paper's comparison, which is shown whether it was run or not.
 PAPER_ALGORITHMS = ("dt", "dtfm")
-PAPER_REGIMES = (1.0, 0.5)
+PAPER_SHARES = (1.0, 0.5)
 N_LATE = 5  # evaluations in the late average
 MEASURES = {"late": "late average", "best": "best evaluation", "final": "final evaluation"}
 THRESHOLD = 0.95  # share of the scale that training takes its minutes to reach
@@ -156,7 +156,7 @@ class Group(NamedTuple):
     :param profile: name of the settings
     :param label: name of what else was changed
     :param tasks: those that the table shows, run or not
-    :param runs: by task, data_share and algorithm, in the order of seeds
+    :param runs: by task, share of the data and algorithm, in the order of seeds
     """
 
     profile: str
@@ -177,7 +177,7 @@ class Group(NamedTuple):
     @property
     def data_shares(self) -> list[float]:
         """Shares of the data, the paper's (unless it is another comparison) and those run, largest first."""
-        paper = () if self.label or self.has_baselines else PAPER_REGIMES
+        paper = () if self.label or self.has_baselines else PAPER_SHARES
         return sorted({*paper, *(data_share for _, data_share, _ in self.runs)}, reverse=True)
 
     @property
