@@ -44,7 +44,7 @@ class Number(NamedTuple):
             number = float(value)
         except OverflowError:  # 10**400
             return False
-        if not math.isfinite(number) or (self.whole and math.isinf(self.high) and int(value) >= 2**63):  # no 64 bits
+        if not math.isfinite(number) or (self.whole and math.isinf(self.high) and number >= 2**63):  # 64 bits hold less
             return False
         at_least = number > self.low if self.above_low else number >= self.low
         return at_least and (number < self.high if self.below_high else number <= self.high)
