@@ -11,8 +11,8 @@ from sb3_dtfm.envs.robosuite.tasks import TASKS
 
 ROBOSUITE_TYPE = 1  # robomimic's number for robosuite's environments
 ROBOTS = ("Panda", ["Panda"])
-# Controller of our environments, by robosuite's names; robosuite <= 1.4 had other ones. `input_ref_frame` does not count: the
-# arm's base is not turned against the world.
+# Controller of our environments, by robosuite's names; robosuite <= 1.4 had other ones. `input_ref_frame` does not count:
+# the arm's base is not turned against the world.
 CONTROLLER: dict[str, Any] = {
     "type": "OSC_POSE",
     "output_min": [-0.05] * 3 + [-0.5] * 3,
