@@ -471,7 +471,7 @@ def enjoy_arguments(argv: Sequence[str]) -> tuple[float | None, list[str]]:
         raise UsageError(f"-n: must be at least 1, got {options.n_timesteps}.")
     folder = options.folder or ("logs" if ours else None)
     with_target_return(options.target_return, None)  # refuses what is none
-    given = {"--env": options.env, "--device": options.device, "--folder": folder}
-    given["-n"] = options.n_timesteps and str(options.n_timesteps)
+    n_steps = None if options.n_timesteps is None else str(options.n_timesteps)
+    given = {"-n": n_steps, "--env": options.env, "--device": options.device, "--folder": folder}
     known = [word for option, value in given.items() if value for word in (option, value)]
     return options.target_return, ["--algo", options.algo, *rest, *known, *_packages(options)]

@@ -102,7 +102,9 @@ def test_a_file_holds_both_and_nothing_that_is_run(model, agent, tmp_path):
             np.testing.assert_array_equal(ours, theirs)
     names = zipfile.ZipFile(tmp_path / "finetuned.zip").namelist()
     assert not [name for name in names if name.endswith((".pth", ".pkl", "data"))]
-    with pytest.raises(ModelFileError, match=r"FinetunedDTFM loads it\. To go on .* --model the DTFM that it began with"):
+    with pytest.raises(
+        ModelFileError, match=r"FinetunedDTFM loads it\. To fine-tune further, .* --model the DTFM that it began with"
+    ):
         DTFM.load(tmp_path / "finetuned")
 
 
