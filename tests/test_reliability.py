@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.data import test_cache, test_corpus
+from tests.data import test_cache, test_corpus, test_robomimic
 from tests.files import test_kills, test_model
 from tests.policies import test_long_runs, test_threads
 from tests.zoo import test_mistakes, test_planted_code, test_resuming
@@ -45,6 +45,7 @@ N_MISTAKES = n_cases(
     test_mistakes.test_a_mistake_of_a_conf_file_is_one_line,
     test_mistakes.test_a_mistake_of_enjoy_is_one_line,
 )
+N_MASKS = n_cases(test_robomimic.test_a_bad_mask_is_refused_as_a_bad_array_is)
 KILLED_REBUILD = test_cache.test_a_build_that_is_killed_anywhere_leaves_nothing_that_disturbs_the_next_one
 CALLS = {way: f"{n_calls:,}" for way, (_, n_calls) in test_long_runs.WAYS.items()}
 
@@ -61,6 +62,7 @@ CALLS = {way: f"{n_calls:,}" for way, (_, n_calls) in test_long_runs.WAYS.items(
         f"| {test_kills.N_KILLS} of {test_kills.N_KILLS} leave files that load",
         f"| 0 of {test_kills.N_KILLS} leave a partial dataset |",
         f"| built again, also at {n_cases(KILLED_REBUILD)} points of a rebuild |",
+        f"| {N_MASKS} of {N_MASKS} refused | `tests/data/test_robomimic.py` |",
         f"| {N_MISTAKES} of {N_MISTAKES} are one line | `tests/zoo/test_mistakes.py` |",
         f"| {test_threads.N_THREADS} threads, each with own state |",
         f"| a million calls of `predict`, {CALLS['chunks']} with chunks, {CALLS['kept keys']} with `kv_cache` |",

@@ -192,7 +192,7 @@ def loading(
         known = {
             "action_space": "env.action_space",
             "observation_space": "env.observation_space",
-            "max_episode_steps": repr(env_kwargs.get("max_episode_steps", gym.spec(env_id).max_episode_steps)),
+            "max_episode_steps": "env.spec.max_episode_steps",
             **({"env_args": "env.unwrapped.env_args"} if env_id.startswith(ROBOSUITE) else {}),
         }
     given = {**known, **{name: repr(value) for name, value in options.items()}}

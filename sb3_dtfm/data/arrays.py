@@ -19,7 +19,7 @@ from sb3_dtfm.data.cache import existing_file
 from sb3_dtfm.data.hdf5 import check_within, describe_hdf5, read_hdf5
 from sb3_dtfm.data.observations import as_vectors
 from sb3_dtfm.data.trajectories import DatasetError, check_real, check_size, wrap_dataset_errors
-from sb3_dtfm.files.printing import warn
+from sb3_dtfm.files import warn
 
 NPZ_SUFFIX, CSV_SUFFIX, PARQUET_SUFFIX = ".npz", ".csv", ".parquet"
 EXPECTED = "the path of a file of flat arrays (.npz, .hdf5) or of a table (.csv, .parquet)"

@@ -20,8 +20,7 @@ from sb3_dtfm.data.expected import Steps, expected_returns_to_go
 from sb3_dtfm.data.short_episodes import ShortEpisodes
 from sb3_dtfm.data.storage import FileStorage, MappedSteps, MemoryStorage
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference, Trajectory, listed, returns_to_go
-from sb3_dtfm.files import replacing
-from sb3_dtfm.files.printing import warn
+from sb3_dtfm.files import replacing, warn
 from sb3_dtfm.transitions import Transitions
 from sb3_dtfm.windows import OBSERVATION, map_tensors
 

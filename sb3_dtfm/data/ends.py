@@ -8,7 +8,7 @@ import numpy as np
 
 from sb3_dtfm.data.arrays import Arrays
 from sb3_dtfm.data.trajectories import DatasetError, check_flags
-from sb3_dtfm.files.printing import warn
+from sb3_dtfm.files import warn
 
 # Names of each array in other libraries' files: the first that is there is read.
 ENDS, LENGTHS = "episode_ends", "episode_lengths"

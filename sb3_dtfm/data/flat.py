@@ -23,7 +23,7 @@ from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import ActionRangeError, DatasetError, Trajectory
 from sb3_dtfm.envs.return_to_go import CHANNELS, IMAGE
 from sb3_dtfm.envs.success import SUCCESS
-from sb3_dtfm.files.printing import warn
+from sb3_dtfm.files import warn
 
 # Names of each array in other libraries' files: the first that is there is read.
 OBSERVATIONS = ("observations", "observation", "obs", "states", "state")

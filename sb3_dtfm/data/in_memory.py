@@ -31,7 +31,7 @@ from sb3_dtfm.data.steps import SHORT_STEP, STEP, arrays_of_steps, is_episodes, 
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_space, wrap_dataset_errors
 from sb3_dtfm.envs.success import reported_success
-from sb3_dtfm.files.printing import warn
+from sb3_dtfm.files import warn
 
 
 def load_steps(

@@ -33,7 +33,7 @@ from sb3_dtfm.data.flat import (
 from sb3_dtfm.data.observations import observed
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_flags, check_size, wrap_dataset_errors
-from sb3_dtfm.files.printing import warn
+from sb3_dtfm.files import warn
 
 SUFFIXES = (".zarr", ".zarr.zip")
 EXPECTED = "the path of a zarr replay buffer (.zarr, .zarr.zip)"

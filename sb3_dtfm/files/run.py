@@ -103,10 +103,23 @@ def check_settings(settings: Mapping[str, Any], where: str, names: Sequence[str]
     :return: the settings, with literals instead of the strings that RL-Zoo would evaluate
     :raises ValueError: a class that is not known here, or Python that is no literal
     """
+    checked = _checked(settings, where, names)
+    for name in (name for name in names if name in CLASSES):
+        for each in _listed(checked.get(name)):
+            found = _check_class(each, name, where)
+            if found is not None and found.__module__.startswith(
+                "sb3_dtfm."
+            ):  # which may make environments of its arguments
+                _check_nested(each, f"{where}: {name}", set())
+    return checked
+
+
+def _checked(settings: Mapping[str, Any], where: str, names: Sequence[str]) -> dict[str, Any]:
+    """As :func:`check_settings`, without the arguments of classes."""
     settings = dict(settings)
     for name in (name for name in names if settings.get(name) is not None):
         if name in CLASSES:
-            for each in settings[name] if isinstance(settings[name], list) else [settings[name]]:
+            for each in _listed(settings[name]):
                 _check_class(each, name, where)
         elif isinstance(settings[name], str):
             try:
@@ -125,6 +138,10 @@ def check_settings(settings: Mapping[str, Any], where: str, names: Sequence[str]
     return settings
 
 
+def _listed(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [] if value is None else [value]
+
+
 def _check_nested(value: Any, where: str, seen: set[int]) -> None:
     """
     Check settings among a class's arguments, as the benchmark's evaluations have them.
@@ -135,7 +152,7 @@ def _check_nested(value: Any, where: str, seen: set[int]) -> None:
         return
     seen.add(id(value))
     if isinstance(value, dict):
-        check_settings(value, where, OF_ACTING)
+        _checked(value, where, OF_ACTING)
         task = value.get("env_id", value.get("task"))
         if isinstance(task, str) and re.fullmatch(r"[\w.]+:\S+", task):  # whose module Gymnasium would import
             raise ValueError(f"{where}: expected the id of a registered task, found {task!r}.")
@@ -143,18 +160,12 @@ def _check_nested(value: Any, where: str, seen: set[int]) -> None:
         _check_nested(each, where, seen)
 
 
-def _check_class(found: Any, name: str, where: str) -> None:
-    """Check one class, or one with its arguments."""
-    named = next(iter(found), None) if isinstance(found, dict) else found
-    _check_name(named, name, where)
-    if isinstance(named, str) and named.startswith("sb3_dtfm."):  # which may make environments of its arguments
-        _check_nested(found, f"{where}: {name}", set())
-
-
-def _check_name(named: Any, name: str, where: str) -> None:
+def _check_class(each: Any, name: str, where: str) -> type | None:
+    """Return a class that is named, alone or with its arguments; None for the alias of a policy."""
+    named = next(iter(each), None) if isinstance(each, dict) else each
     module = named.rpartition(".")[0] if isinstance(named, str) else ""
     if name == "policy" and not module:
-        return  # an alias, as "MlpPolicy"
+        return None  # an alias, as "MlpPolicy"
     if not module:
         raise ValueError(f"{where}: {name} is {named!r}; expected the dotted name of a {CLASSES[name]}.")
     if module not in sys.modules and module.partition(".")[0] not in PACKAGES:
@@ -168,6 +179,7 @@ def _check_name(named: Any, name: str, where: str) -> None:
         raise ValueError(f"{where}: {name} names {named!r}, which cannot be imported: {error}.") from error
     if not (isinstance(found, type) and issubclass(found, kind)):
         raise ValueError(f"{where}: {name} names {named!r}, which is no {CLASSES[name]}.")
+    return found
 
 
 def _import(name: str) -> Any:

@@ -70,6 +70,10 @@ OF_YAML = {
     "name in args.yml": ("args.yml", "env_kwargs: {\"a:__import__('os').mkdir('ran')#\": 1}\n"),
     "pickled dataset": ("config.yml", "dataset_kwargs: {allow_pickle: true}\n"),
     "a circle": ("config.yml", "env_wrapper: [{sb3_dtfm.envs.ReturnToGoWrapper: &a {b: *a, env_wrapper: [os.mkdir]}}]\n"),
+    "a circle of wrappers": (
+        "config.yml",
+        f"env_wrapper: &a [{{sb3_dtfm.envs.ReturnToGoWrapper: {{env_wrapper: *a, vec_env_wrapper: {PLANTED}.Wrapper}}}}]\n",
+    ),
     "no YAML": ("config.yml", "a: [\n"),
     "no mapping": ("config.yml", "- a\n"),
     "no text": ("config.yml", "\xff\x00"),
