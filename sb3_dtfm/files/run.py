@@ -107,9 +107,8 @@ def check_settings(settings: Mapping[str, Any], where: str, names: Sequence[str]
     for name in (name for name in names if name in CLASSES):
         for each in _listed(checked.get(name)):
             found = _check_class(each, name, where)
-            if found is not None and found.__module__.startswith(
-                "sb3_dtfm."
-            ):  # which may make environments of its arguments
+            # Ours may make environments of its arguments.
+            if found is not None and found.__module__.startswith("sb3_dtfm."):
                 _check_nested(each, f"{where}: {name}", set())
     return checked
 
@@ -162,7 +161,7 @@ def _check_nested(value: Any, where: str, seen: set[int]) -> None:
 
 def _check_class(each: Any, name: str, where: str) -> type | None:
     """Return a class that is named, alone or with its arguments; None for the alias of a policy."""
-    named = next(iter(each), None) if isinstance(each, dict) else each
+    named: Any = next(iter(each), None) if isinstance(each, dict) else each
     module = named.rpartition(".")[0] if isinstance(named, str) else ""
     if name == "policy" and not module:
         return None  # an alias, as "MlpPolicy"
