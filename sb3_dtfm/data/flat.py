@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import math
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -147,7 +148,7 @@ def load_flat(
 
     :param dataset: path of the file, arrays by name, or a DataFrame
     :param observation_keys: which arrays make up the observation, in this order, each (N, ...); also entries of dictionary
-        observations
+        observations. Where each entry of the environment's Dict has an array of its name and size, these are the default
     :param action_keys: which arrays make up the action, in this order, each (N, ...)
     :param action_bounds: smallest and largest action that the environment accepts, numbers or (A,) each; where they are not
         given, a file's own `action_low` and `action_high`, or those of `action_space`, or -1 and 1. For Discrete actions
@@ -166,14 +167,25 @@ def load_flat(
         actions = _actions(arrays, action_keys, action_space)
         images = [name for name in arrays.names if str(name).startswith(STORED_IMAGE)]
         alone = images and not arrays.has(OBSERVATIONS)
-        keys = list(observation_keys or ([] if alone else arrays.columns(OBSERVATIONS)))
-        if observation_keys is None:
+        entries = [] if observation_keys else _entries(arrays, observation_space)
+        keys = list(observation_keys or entries or ([] if alone else arrays.columns(OBSERVATIONS)))
+        if observation_keys is None and not entries:
             keys += images
             _warn_of_images(arrays, {*keys, *action_keys, *NOT_NEEDED}, len(actions))
         observations = _observations(arrays, keys, len(actions), observation_space)
         ends = read_ends(arrays, len(actions), max_episode_steps)
         warn_of_made_up_rewards(set(map(str, arrays.names)) - {*keys, *action_keys}, arrays.source)
         return _read(arrays, observations, actions, ends, action_bounds, clip_actions, action_space, on_invalid, storage)
+
+
+def _entries(arrays: Arrays, space: spaces.Space | None) -> list[str]:
+    """An environment's entries, if each has an array of its name and its size."""
+    parts = space.spaces if isinstance(space, spaces.Dict) else {}
+    for name, part in parts.items():
+        found = arrays.describe(name) if name in arrays.names else None
+        if found is None or part.shape is None or math.prod(found[0][1:]) != math.prod(part.shape):
+            return []
+    return sorted(parts)
 
 
 def _warn_of_images(arrays: Arrays, others: Collection[str], n_steps: int) -> None:
@@ -269,7 +281,7 @@ def _observations(arrays: Arrays, keys: Sequence[str], n_steps: int, space: spac
         name = arrays.name(OBSERVATIONS)
         parts = {name: observed(arrays.stored(name), keys, space, f"{arrays.source}: {name}")}
     else:
-        known = {key: space if key in OBSERVATIONS else part_of(space, key) for key in keys}
+        known = {key: part_of(space, key) or (space if key in OBSERVATIONS else None) for key in keys}
         stored = {key: arrays.stored(arrays.name((key,))) for key in keys}
         parts = {key: observed(stored[key], None, known[key], f"{arrays.source}: {key}") for key in keys}
     images: dict[str, np.ndarray] = {}

@@ -61,7 +61,7 @@ def test_a_target_of_the_environment_comes_before_the_datas(cheetah_buffer, caps
 
 
 def test_environments_in_their_own_processes_get_the_target_too(cheetah_buffer):
-    env = SubprocVecEnv([make_env_without_target] * 2)
+    env = SubprocVecEnv([make_env_without_target] * 2, start_method="fork")  # another method imports all anew
     model = make_model(DT, cheetah_buffer, env=env)
     assert targets(env) == [model.target_return] * 2
     env.close()

@@ -136,6 +136,30 @@ def test_other_names_and_chosen_observations(path):
     np.testing.assert_array_equal(both.observations, np.hstack([extra.reshape(N, 4), np.ones((N, 1))]))
 
 
+ENTRIES = spaces.Dict(observation=spaces.Box(-9, 9, (2,)), desired_goal=spaces.Box(-9, 9, (1,)), pressed=spaces.Discrete(3))
+
+
+@pytest.mark.parametrize("source", [write, lambda path, **changes: arrays(**changes)], ids=["npz", "memory"])
+def test_arrays_by_the_names_of_an_environment_s_entries_are_the_observation(source, path):
+    """In the wrapper's order. If one is missing or of another size, the array of observations is read as ever."""
+    parts = dict(observation=np.ones((N, 2)), desired_goal=np.arange(N, dtype=float), pressed=np.arange(N) % 3)
+    read = {"observations": None, **parts}
+    one_hot = np.eye(3)[parts["pressed"]]
+    expected = np.hstack([parts["desired_goal"][:, None], parts["observation"], one_hot])
+    buffer = load_dataset(source(path, **read), observation_space=ENTRIES)
+    np.testing.assert_array_equal(buffer.observations, expected)
+    choice = load_dataset(
+        source(path, observations=None, observation=np.arange(N)),
+        observation_space=spaces.Dict(observation=spaces.Discrete(N)),
+    )
+    np.testing.assert_array_equal(choice.observations, np.eye(N))
+    chosen = load_dataset(source(path, **read), observation_space=ENTRIES, observation_keys=["observation"])
+    assert chosen.observation_space.shape == (2,)
+    for change in ({"pressed": None}, {"observation": np.ones((N, 3))}):
+        others = load_dataset(source(path, **{**parts, **change}), observation_space=ENTRIES)
+        np.testing.assert_allclose(others.observations, arrays()["observations"], rtol=1e-6)
+
+
 def hdf5(path, **changes):
     path = path.with_suffix(".hdf5")
     with h5py.File(path, "w") as file:

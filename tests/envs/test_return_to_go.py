@@ -1,6 +1,7 @@
 """The return-to-go wrapper: its spaces, its countdown, and that it agrees with recorded data to the bit."""
 
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,9 @@ from sb3_dtfm.envs import (
 from sb3_dtfm.recording.agent import record_agent
 
 register_gymnasium_robotics()
+
+# Processes that are forked have imported everything already.
+VEC_ENVS = [DummyVecEnv, pytest.param(partial(SubprocVecEnv, start_method="fork"), id="SubprocVecEnv")]
 
 
 class ConstantReward(gym.Env):
@@ -102,7 +106,7 @@ def monitored_env() -> gym.Env:
     return Monitor(ReturnToGoWrapper(gym.make("Pendulum-v1"), 1.0))
 
 
-@pytest.mark.parametrize("vec_env_class", [DummyVecEnv, SubprocVecEnv])
+@pytest.mark.parametrize("vec_env_class", VEC_ENVS)
 def test_the_target_is_settable_through_a_vec_env(vec_env_class: type):
     vec_env = vec_env_class([monitored_env, monitored_env])
     vec_env.reset()
@@ -251,7 +255,7 @@ def test_success_has_the_name_that_sb3_counts_by(told, shown):
     assert "is_success" not in told or told["is_success"] is False, "the environment's own is left alone"
 
 
-@pytest.mark.parametrize("vec_env_class", [DummyVecEnv, SubprocVecEnv])
+@pytest.mark.parametrize("vec_env_class", VEC_ENVS)
 def test_the_task_is_known_where_its_whole_spec_cannot_leave_a_process(vec_env_class):
     def make():
         env = gym.make("Pendulum-v1", max_episode_steps=70)
@@ -279,7 +283,7 @@ class Horizon(TimeLimit):
     """Another name, by which it is not known in a process of its own."""
 
 
-@pytest.mark.parametrize("vec_env_class", [DummyVecEnv, SubprocVecEnv])
+@pytest.mark.parametrize("vec_env_class", VEC_ENVS)
 def test_an_evaluation_ends_where_a_time_limit_stands_outside_the_monitor(vec_env_class):
     def make() -> gym.Env:
         return ReturnToGoWrapper(TimeLimit(Monitor(bare_env()), 7), 1.0)
@@ -355,7 +359,7 @@ def test_ends_that_no_monitor_sees_are_warned_of():
         assert len(told) == n_warnings
 
 
-@pytest.mark.parametrize("vec_env_class", [DummyVecEnv, SubprocVecEnv])
+@pytest.mark.parametrize("vec_env_class", VEC_ENVS)
 def test_a_time_limit_outside_of_everything_is_refused(vec_env_class):
     def check(*makers) -> None:
         env = vec_env_class(list(makers))

@@ -1,6 +1,7 @@
 """`sb3-dtfm train --resume`: a run that was ended or killed becomes what it would have been."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -165,18 +166,34 @@ def kill(interval: float) -> None:
     assert (RUN / START).is_file()
 
 
-@pytest.mark.parametrize("interval", [0.0, 1e9])
-def test_a_killed_run_goes_on_from_its_last_checkpoint_or_from_the_start(interval, straight, workplace):
+@pytest.fixture(scope="module")
+def killed(minari_folder, tmp_path_factory):
+    """Folder of a run that was killed behind its last checkpoint."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder := tmp_path_factory.mktemp("killed"))
+        patch.setenv("MINARI_DATASETS_PATH", str(minari_folder))
+        kill(0.0)
+    return folder
+
+
+def test_a_killed_run_goes_on_from_its_last_checkpoint(killed, straight, workplace):
     """Killed behind a log entry and an evaluation that its checkpoint does not know: they are not there twice."""
-    kill(interval)
-    assert (RUN / CHECKPOINT).is_file() == (interval == 0.0)
+    shutil.copytree(killed, ".", dirs_exist_ok=True)
+    assert (RUN / CHECKPOINT).is_file()
+    assert resume(*training()[1:]) == 0
+    assert_same(what_was_learned(), straight)
+
+
+def test_a_run_that_was_killed_before_its_first_checkpoint_begins_anew(straight, workplace):
+    kill(1e9)
+    assert not (RUN / CHECKPOINT).exists()
     assert resume(*training()[1:]) == 0
     assert_same(what_was_learned(), straight)
 
 
 @pytest.mark.parametrize("given_back", ["what was deleted", "another model of the run"])
-def test_without_its_checkpoint_a_killed_run_does_not_begin_anew(given_back, straight, workplace, capsys):
-    kill(0.0)
+def test_without_its_checkpoint_a_killed_run_does_not_begin_anew(given_back, killed, straight, workplace, capsys):
+    shutil.copytree(killed, ".", dirs_exist_ok=True)
     checkpoint = RUN / CHECKPOINT
     kept = checkpoint.rename("kept.zip")
     held = {path: path.read_bytes() for path in RUN.rglob("*") if path.is_file()}
