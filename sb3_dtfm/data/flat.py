@@ -148,7 +148,7 @@ def load_flat(
 
     :param dataset: path of the file, arrays by name, or a DataFrame
     :param observation_keys: which arrays make up the observation, in this order, each (N, ...); also entries of dictionary
-        observations. Where each entry of the environment's Dict has an array of its name and size, these are the default
+        observations. The default are the entries of the environment's Dict if each has an array of its name and size
     :param action_keys: which arrays make up the action, in this order, each (N, ...)
     :param action_bounds: smallest and largest action that the environment accepts, numbers or (A,) each; where they are not
         given, a file's own `action_low` and `action_high`, or those of `action_space`, or -1 and 1. For Discrete actions

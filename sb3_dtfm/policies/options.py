@@ -90,7 +90,7 @@ class PolicyOptions(Options):
         flow has learned, they differ more, and the critic has more to choose among
     :param temperature: how much chance that choice leaves, in units of how far actions' values spread in the data; 0
         takes the one that both values of the critic find better than the first, by the larger gain
-    :param kv_cache: act on the keys and values kept of earlier steps instead of recomputing the window: two to three times
+    :param kv_cache: act on the keys and values kept of earlier steps instead of recomputing the window: up to 2.5 times
         faster, and equal until the window slides (see :func:`~sb3_dtfm.networks.cache.extend`)
     :raises ValueError: an option out of range, by name
     """
