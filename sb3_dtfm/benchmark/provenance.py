@@ -85,7 +85,7 @@ def read_data(env_id: str, settings: dict[str, Any]) -> TrajectoryBuffer:
     """
     with contextlib.closing(gym.make(env_id, **(settings.get("env_kwargs") or {}))) as env:
         limit = None if env.spec is None else env.spec.max_episode_steps
-        known = {"action_space": env.action_space, "max_episode_steps": limit}
+        known = {"observation_space": env.observation_space, "action_space": env.action_space, "max_episode_steps": limit}
     buffer = load_dataset(settings["dataset"], **{**known, **without_pickles(settings.get("dataset_kwargs"))})
     buffer.check_task(env_id)
     return buffer

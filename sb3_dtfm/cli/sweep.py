@@ -15,9 +15,8 @@ from tqdm import tqdm
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.evaluation import SeededEpisodes, evaluate
-from sb3_dtfm.benchmark.provenance import commit, versions
+from sb3_dtfm.benchmark.provenance import commit, read_data, versions
 from sb3_dtfm.benchmark.report.statistics import Interval, student_t
-from sb3_dtfm.data import load_dataset
 from sb3_dtfm.envs import ReturnToGoWrapper
 from sb3_dtfm.files import replacing
 from sb3_dtfm.recording.loading import AgentFiles, algorithm_of, find_agent, load_agent
@@ -60,10 +59,10 @@ def main(argv: Sequence[str]) -> None:
     options = _parser().parse_args(argv)
     import_packages(options.gym_packages)
     algorithms = [options.algo or algorithm_of(model) for model in options.models]
-    buffer = load_dataset(options.dataset, **key_values("--dataset-kwargs", options.dataset_kwargs))
-    buffer.check_task(options.env)
-    returns = buffer.episode_returns
     agents = [find_agent(model, options.env) for model in options.models]
+    given = {"dataset": options.dataset, "dataset_kwargs": key_values("--dataset-kwargs", options.dataset_kwargs)}
+    given["env_kwargs"] = {**agents[0].env_kwargs, **key_values("--env-kwargs", options.env_kwargs)}
+    returns = read_data(options.env, given).episode_returns
     models = [load_agent(algo, agent.model, "cpu") for algo, agent in zip(algorithms, agents, strict=True)]
     acting = key_values("--acting", options.acting)
     for model in models:

@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 
 from sb3_dtfm.benchmark import provenance
 from sb3_dtfm.data import DatasetError, load_dataset
@@ -73,6 +74,16 @@ def test_a_robomimic_file_names_its_task_and_not_its_folder(env_args, source, tm
         "dataset": "lift.hdf5", "recorded_from": source, "n_episodes": 2, "n_steps": 6, "mean_return": 1.0,
         "best_return": 1.0, "success_rate": 1.0, "best_success": 1.0,
     }  # fmt: skip
+
+
+def test_choices_are_read_as_the_environment_has_them(tmp_path):
+    """Flat arrays tell neither how many actions there are nor how many observations."""
+    states, ends = np.array([36, 24, 25, 26]), np.array([4])
+    np.savez(tmp_path / "cliff.npz", observations=states, actions=states % 4, rewards=-np.ones(4), episode_ends=ends)
+    buffer = provenance.read_data("CliffWalking-v1", {"dataset": str(tmp_path / "cliff.npz")})
+    assert buffer.action_space == spaces.Discrete(4)
+    np.testing.assert_array_equal(buffer.observations.argmax(axis=1), states)
+    assert buffer.observation_space.shape == (48,)
 
 
 def test_a_dataset_that_cannot_be_read_is_refused(tmp_path):

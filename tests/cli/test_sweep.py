@@ -82,7 +82,9 @@ def test_long_paths_are_named_by_what_tells_them_apart():
     ],
 )
 def test_what_is_not_there_is_named(arguments, message, workplace, capsys):
-    (workplace / "model.zip").touch()
+    (workplace / "dt").mkdir()
+    for model in ("model.zip", "dt/model.zip"):
+        (workplace / model).touch()
     assert main(["sweep", *arguments]) == 2
     assert message in capsys.readouterr().err
 
