@@ -218,7 +218,7 @@ def with_nearest(names: Iterable[str], known: Iterable[str]) -> str:
 
 def documented_parameters(*described: type, order: Iterable[str] = (), decided: Container[str] = ()) -> str:
     """
-    The `:param` entries of classes' docstrings, those of :class:`Options` with their defaults.
+    The `:param` entries of classes' docstrings, those of :class:`Options` with their defaults and ranges.
 
     :param described: the classes
     :param order: of parameters; others follow
@@ -227,9 +227,11 @@ def documented_parameters(*described: type, order: Iterable[str] = (), decided: 
     found: dict[str, str] = {}
     for each in described:
         defaults = each.defaults() if issubclass(each, Options) else {}
+        rules = {each.name: each.metadata["rule"] for each in dataclasses.fields(each)} if defaults else {}
         text = inspect.cleandoc(each.__doc__ or "")
         for name, entry in re.findall(r"^:param (\w+):(.*?)(?=^:|\Z)", text, re.DOTALL | re.MULTILINE):
             default = "decided from the data" if name in decided else repr(defaults.get(name))
-            found[name] = entry.rstrip() + (f" (default: {default})" if name in defaults else "")
+            limits = f"; {rules[name]}" if isinstance(rules.get(name), Number) else ""
+            found[name] = entry.rstrip() + (f" (default: {default}{limits})" if name in defaults else "")
     names = [*(name for name in order if name in found), *found]
     return "\n".join(f":param {name}:{found[name]}" for name in dict.fromkeys(names))

@@ -20,21 +20,21 @@ class TrainingOptions(Options):
     """
     Options of the windows that are drawn, and of the gradient steps that learn from them.
 
-    :param batch_size: windows in a gradient step, of all processes together; 64 of less than 10,000 recorded steps, and
-        256 of more
-    :param context_length: K, steps the policy sees
-    :param return_weighting: w: of mixed data, a step of the best episode is learned from 1 + w times as often as one of the
-        worst, and others by their returns in between (Yue et al., 2022); 0 learns from all alike. 5 where returns tell how
-        episodes act, and 0 elsewhere
-    :param weight_decay: AdamW's, on weight matrices only
-    :param learning_rate_schedule: factor on the learning rate: "constant", or "linear" or "cosine" down to zero
-    :param warmup_steps: gradient steps over which the learning rate rises linearly from zero; 0 for none
-    :param max_grad_norm: clip the gradient's norm to this; None and 0 do not clip
-    :param ema_decay: decay of the exponential moving average of weights that acts; 0 acts with the trained weights
-    :param precision: of matrix products: "float32", "bfloat16" (autocast), or "auto": bfloat16 where the hardware has
-        instructions for it, on a CPU only if it is the faster one for this model, which is measured once
-    :param compile: compile the loss with `torch.compile`; None does so on a GPU, where one process starts its kernels as a
-        CUDA graph. It takes a minute, and a C++ compiler
+    :param batch_size: number of windows in a gradient step, of all processes together. It is 64 for fewer than 10,000
+        recorded steps, else 256
+    :param context_length: number of steps that the policy observes, K
+    :param return_weighting: weight w of good episodes: a step of the best one is drawn 1 + w times as often as one of the
+        worst, others in between by their returns (Yue et al., 2022); 0 draws all alike. It is 5 where returns predict
+        actions, else 0
+    :param weight_decay: AdamW's weight decay, of weight matrices only
+    :param learning_rate_schedule: schedule of the learning rate: "constant", or "linear" or "cosine" down to zero
+    :param warmup_steps: number of gradient steps over which the learning rate rises linearly from zero
+    :param max_grad_norm: largest norm of the gradient, to which larger ones are clipped; None and 0 do not clip
+    :param ema_decay: decay of the moving average of the weights, which acts; 0 acts with the trained weights
+    :param precision: precision of matrix products: "float32", "bfloat16" (autocast), or "auto": bfloat16 if the hardware
+        has instructions for it, on a CPU only if it is faster for this model, which is measured once
+    :param compile: whether the loss is compiled with `torch.compile`, which takes a minute and a C++ compiler; None
+        compiles on a GPU, where one process starts its kernels as a CUDA graph
     :raises ValueError: an option out of range, by name
     """
 

@@ -54,13 +54,18 @@ def benchmark_parser() -> argparse.ArgumentParser:
         help="Gymnasium ids, or names in --datasets; those with a dataset by default",
     )
     grid(
-        "--fractions", type=float, nargs="+", default=[1.0, 0.5], metavar="SHARE", help="of the episodes; 1.0 0.5 by default"
+        "--fractions",
+        type=float,
+        nargs="+",
+        default=[1.0, 0.5],
+        metavar="SHARE",
+        help="shares of the episodes to learn from; 1.0 0.5 by default",
     )
     baselines = f"{' and '.join(ALGORITHMS)} by default; bc clones behaviour, bc-best that of the best tenth of the episodes"
     grid("--algo", dest="algos", nargs="+", choices=ALGOS, default=list(ALGORITHMS), help=baselines)
     grid("--seeds", "--seed", type=int, nargs="+", default=[0], metavar="SEED", help="0 by default")
     grid("--profile", default="default", help="default, paper, a YAML file, or a folder with dt.yml and dtfm.yml")
-    grid("--gym-packages", nargs="+", default=[], metavar="MODULE", help="to import first: they register tasks")
+    grid("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import first, which register tasks")
     grid("--label", default="", help="name of what -params change; part of a run's identity")
     data = parser.add_argument_group("data").add_argument
     data("--dataset", **several, metavar="TASK=DATASET", help="Minari id, robomimic file or flat arrays")
@@ -74,12 +79,12 @@ def benchmark_parser() -> argparse.ArgumentParser:
     training("--eval-episodes", type=int, default=20, metavar="N", help="episodes of each; 20 by default")
     training("--final-episodes", type=int, default=50, metavar="N", help="episodes after the last step; 50 by default")
     training("--n-eval-envs", type=int, default=10, metavar="N", help="environments side by side; 10 by default")
-    training("--env-kwargs", **several, metavar="KEY:VALUE", help="as in train")
-    training("--vec-env", choices=("dummy", "subproc"), default="dummy", help="as in train")
-    training("--device", default="auto", help="as in train")
+    training("--env-kwargs", **several, metavar="KEY:VALUE", help="arguments of the environment, as in train")
+    training("--vec-env", choices=("dummy", "subproc"), default="dummy", help="kind of vectorised environment, as in train")
+    training("--device", default="auto", help="device to train on, as in train")
     running = parser.add_argument_group("running").add_argument
     running("--jobs", type=int, default=1, metavar="N", help="runs at once, each with 1/N of the cores; 1 by default")
-    running("-o", "--results", default="results", metavar="DIR", help="where rows go; results by default")
+    running("-o", "--results", default="results", metavar="DIR", help="folder of the rows, results by default")
     running("-f", "--log-folder", default="logs/benchmark", metavar="DIR", help="models and logs; logs/benchmark by default")
     return parser
 

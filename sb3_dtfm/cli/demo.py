@@ -41,7 +41,7 @@ def main(argv: Sequence[str]) -> None:
         prog="sb3-dtfm demo",
         description="Record demonstrations of robosuite's Lift, train DTFM on half of them, and measure its success.",
     )
-    parser.add_argument("--output", default="demo", metavar="FOLDER", help="where everything goes, ./demo by default")
+    parser.add_argument("--output", default="demo", metavar="FOLDER", help="folder of all files, ./demo by default")
     parser.add_argument("--steps", type=at_least(1), metavar="N", help="gradient steps, those of zoo_configs by default")
     parser.add_argument("--episodes", type=at_least(1), default=50, metavar="N", help="evaluation episodes, 50 by default")
     parser.add_argument("--demonstrations", type=at_least(2), default=N_DEMONSTRATIONS, metavar="N", help="200 by default")

@@ -30,7 +30,7 @@ def main(argv: Sequence[str]) -> None:
         default=[],
         type=key_value,
         metavar="KEY:VALUE",
-        help="for example flow_steps:10 or kv_cache:True; as saved by default",
+        help="way of acting, for example flow_steps:10 or kv_cache:True; as saved by default",
     )
     options = parser.parse_args(argv)
     path = find_model(options.model)

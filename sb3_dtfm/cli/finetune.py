@@ -89,7 +89,7 @@ def _parser() -> argparse.ArgumentParser:
     argument("-conf", "--conf-file", help="the packaged settings if not given, else a YAML file or a Python package")
     every = "timesteps between two evaluations; by default a tenth of all: steps with dtfm, else decisions"
     argument("--eval-freq", type=int, metavar="N", help=every)
-    argument("--eval-episodes", type=int, default=20, metavar="N", help="of an evaluation; 20 by default")
+    argument("--eval-episodes", type=int, default=20, metavar="N", help="episodes of an evaluation; 20 by default")
     argument("--dataset", help=argparse.SUPPRESS)
     argument("--gym-packages", nargs="+", default=[], help=argparse.SUPPRESS)
     argument("--resume", metavar="RUN", help="go on with an interrupted run of --algo dtfm, as logs/dtfm/HalfCheetah-v5_2")

@@ -126,8 +126,15 @@ def _parser() -> argparse.ArgumentParser:
         help="arguments of load_dataset, e.g. best_share:0.1",
     )
     argument("--env", metavar="ID", help="Gymnasium id to check the dataset against; the dataset's by default")
-    argument("--env-kwargs", nargs="+", type=key_value, default=[], metavar="KEY:VALUE", help="of gymnasium.make for --env")
-    argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="to import first: they register tasks")
+    argument(
+        "--env-kwargs",
+        nargs="+",
+        type=key_value,
+        default=[],
+        metavar="KEY:VALUE",
+        help="arguments of gymnasium.make for --env",
+    )
+    argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import first, which register tasks")
     argument("-o", "--output", default="dataset.png", metavar="FILE", help="PNG to write; dataset.png by default")
     return parser
 

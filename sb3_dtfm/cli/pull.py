@@ -52,7 +52,7 @@ def _parser() -> argparse.ArgumentParser:
     argument = parser.add_argument
     argument("--algo", required=True, help=" or ".join(ALGORITHMS))
     argument("--env", required=True, type=EnvironmentName, help="Gymnasium id")
-    argument("-f", "--folder", default="logs", help="where runs are, logs by default")
+    argument("-f", "--folder", default="logs", help="folder of runs, logs by default")
     argument("--exp-id", type=int, default=0, metavar="N", help="number of the run to make, the next one by default")
     hub.add_repository_arguments(parser)
     return parser

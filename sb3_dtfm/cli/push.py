@@ -121,10 +121,12 @@ def _parser() -> argparse.ArgumentParser:
     add_model_arguments(parser)
     hub.add_repository_arguments(parser)
     argument = parser.add_argument
-    argument("-m", "--commit-message", default="Upload of sb3-dtfm", metavar="TEXT", help="of the upload")
+    argument("-m", "--commit-message", default="Upload of sb3-dtfm", metavar="TEXT", help="message of the upload")
     argument("-n", "--n-timesteps", type=at_least(1), default=1000, metavar="N", help="steps of the video, 1000 by default")
     argument("--no-render", action="store_true", help="no video")
-    argument("--n-eval-episodes", type=at_least(1), default=10, metavar="N", help="of the evaluation, 10 by default")
-    argument("--seed", type=int, default=0, help="of the evaluation and the video, 0 by default")
-    argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="to import for their tasks")
+    argument(
+        "--n-eval-episodes", type=at_least(1), default=10, metavar="N", help="episodes of the evaluation, 10 by default"
+    )
+    argument("--seed", type=int, default=0, help="seed of the evaluation and the video, 0 by default")
+    argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import first, which register tasks")
     return parser

@@ -32,7 +32,7 @@ def main(argv: Sequence[str]) -> None:
     )
     parser.add_argument("results", nargs="+", help="CSV tables, files of rows, or folders of either")
     argument = parser.add_argument
-    argument("-o", "--output", default="docs", metavar="DIR", help="where report.md and the PNGs go; docs by default")
+    argument("-o", "--output", default="docs", metavar="DIR", help="folder of report.md and its pictures, docs by default")
     argument(
         "--env", "--tasks", dest="tasks", nargs="+", default=[], metavar="TASK", help="show these first, even if not run"
     )

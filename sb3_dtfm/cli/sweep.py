@@ -99,20 +99,28 @@ def _parser() -> argparse.ArgumentParser:
     argument("models", nargs="+", metavar="MODEL", help="zip file of dt or dtfm, or folder of a run of `train`")
     argument("--env", required=True, metavar="TASK", help="Gymnasium id")
     argument(
-        "--dataset", required=True, metavar="DATASET", help="what was learned from: Minari id, robomimic file or flat arrays"
+        "--dataset", required=True, metavar="DATASET", help="data that the models learned from: Minari id, file or folder"
     )
     argument("--dataset-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="options of its reader")
-    argument("--algo", choices=ALGORITHMS, help="of all models; by the folder dt or dtfm that they are in by default")
+    argument("--algo", choices=ALGORITHMS, help="algorithm of all models; by default the folder dt or dtfm that they are in")
     argument(
         "--returns", nargs="+", type=float, metavar="R", help="target returns; evenly over the dataset's returns by default"
     )
-    argument("--points", type=at_least(2), default=9, metavar="N", help="how many then; 9 by default")
-    argument("--episodes", type=at_least(1), default=10, metavar="N", help="for each return; 10 by default")
+    argument(
+        "--points", type=at_least(2), default=9, metavar="N", help="number of target returns without --returns; 9 by default"
+    )
+    argument("--episodes", type=at_least(1), default=10, metavar="N", help="episodes for each target return; 10 by default")
     argument("--n-envs", type=at_least(1), default=10, metavar="N", help="environments side by side; 10 by default")
-    argument("--acting", nargs="+", default=[], metavar="KEY:VALUE", help="for example flow_steps:10; as saved by default")
-    argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="to import first: they register tasks")
-    argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="as in train")
-    argument("--seed", type=int, default=0, help="of the initial states, the same for each return and model")
+    argument(
+        "--acting",
+        nargs="+",
+        default=[],
+        metavar="KEY:VALUE",
+        help="way of acting, for example flow_steps:10; as saved by default",
+    )
+    argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import first, which register tasks")
+    argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="arguments of the environment, as in train")
+    argument("--seed", type=int, default=0, help="seed of the initial states, which all returns and models share")
     argument(
         "-o",
         "--output",

@@ -62,5 +62,5 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="RL-Zoo's record_training: all checkpoints of the run, the last and the best model",
     )
-    argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="to import for their tasks")
+    argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import first, which register tasks")
     return parser

@@ -147,9 +147,9 @@ def _of_episodes(buffer: TrajectoryBuffer) -> list[str]:
     if n < FEW_EPISODES:
         remarks.append(f"There are {_count(n, 'episode')}: what is learned depends on which ones.")
     if n_twice and not images_alone(buffer):
-        remarks.append(f"There twice: {_count(n_twice, 'episode')} of {n}.")
+        remarks.append(f"Stored twice: {_count(n_twice, 'episode')} of {n}.")
     if n_short:
-        remarks.append(f"Of a single step: {_count(n_short, 'episode')} of {n}.")
+        remarks.append(f"With a single step: {_count(n_short, 'episode')} of {n}.")
     if n_stopped:
         remarks.append(f"Neither terminated nor truncated, the recording just stops: {_count(n_stopped, 'episode')} of {n}.")
     if buffer.n_dropped:
@@ -157,7 +157,7 @@ def _of_episodes(buffer: TrajectoryBuffer) -> list[str]:
     if not returns.any():
         remarks.append("No episode has any return, so a target return has no effect.")
     elif np.ptp(returns) == 0:
-        remarks.append(f"All returns are {returns[0]:g}: the policy copies what it sees, whatever its target return.")
+        remarks.append(f"All returns are {returns[0]:g}: the policy copies the data, whatever its target return.")
     explained = explained_by_start(buffer)
     if explained >= START_DECIDES:
         start = f"Returns depend on how an episode starts ({100 * explained:.0f} % of their variance)"

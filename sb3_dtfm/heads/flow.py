@@ -29,17 +29,17 @@ class FlowOptions(Options):
     """
     Options of :class:`FlowHead`.
 
-    :param flow_steps: steps of the ODE solver; 0 takes the mean action, which no noise changes
-    :param flow_solver: an ODE solver, euler, midpoint, heun or rk4; or one_step, the distilled network
+    :param flow_steps: number of the ODE solver's steps; 0 takes the mean action, which no noise changes
+    :param flow_solver: ODE solver: "euler", "midpoint", "heun" or "rk4"; or "one_step", the distilled network
     :param flow_hidden_dim: width of the vector field's hidden layers
-    :param flow_n_layers: number of its hidden layers
-    :param flow_prediction: what the head learns of the path: its "velocity", or the "action" it leads to
-    :param flow_draws: noises and times that each step is trained with; more than one where an encoder of images, which all
-        of them share, costs most of a gradient step
-    :param flow_tau_exponent: tau of the loss is u to this power for u uniform in [0, 1]: above 1 it is more often near the
-        noise, where the action has to come from the hidden state
-    :param regression_coef: weight of the regression of the action from the hidden state; 0 leaves it out
-    :param one_step_policy: train a network that replaces the solver by one evaluation
+    :param flow_n_layers: number of the vector field's hidden layers
+    :param flow_prediction: output of the vector field: "velocity" of the path, or the "action" at its end
+    :param flow_draws: number of noises and times that are drawn for each step in training; more than one if an encoder of
+        images, which all of them share, costs most of a gradient step
+    :param flow_tau_exponent: exponent p of the loss's times tau = u^p, with u uniform in [0, 1]; above 1 more of them are
+        near the noise, where the action has to come from the hidden state
+    :param regression_coef: weight of the regression of the action from the hidden state in the loss; 0 leaves it out
+    :param one_step_policy: whether a network is trained that replaces the solver by one evaluation
     :raises ValueError: an option out of range, or a way of acting that the others do not train, by name
     """
 

@@ -53,45 +53,49 @@ class PolicyOptions(Options):
 
     :param embed_dim: width of the Transformer
     :param n_layers: number of Transformer blocks
-    :param n_heads: attention heads
-    :param dropout: dropout probability of the Transformer
-    :param chunk_size: H, actions that one hidden state leads to: the newest step's and the next ones (action chunking, Zhao
-        et al., 2023; Chi et al., 2023). 1 is Decision Transformer's
-    :param n_action_steps: actions executed before the next prediction; half of the chunk if not given
-    :param return_conditioning: learn and act by the return-to-go; without it, the policy clones what was recorded
-    :param expected_return_steps: n: a step's return-to-go is the rewards of n steps and the return expected after such an
-        observation, so that a high target return does not stand for chance (Paster et al., 2022); 0 takes the recorded
-        one. 50 where returns tell how episodes act and no number makes up half of the rewards, and 0 elsewhere
-    :param return_range: with `clip_return_to_go`, keep the return-to-go also within what may be expected from such an
-        observation, see :class:`~sb3_dtfm.policies.network.ReturnRange`
-    :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step. A target return
-        above any episode's, or falling behind, then stays an input like those the policy learned from
-    :param return_scaling: "timestep" or "max", see :class:`~sb3_dtfm.policies.normalization.Normalization`
-    :param film_return_to_go: let the return-to-go scale and shift the input of each Transformer block, besides being a token
-    :param observation_scaling: "std" divides observations by their standard deviation, "robust" by the lower quartile of
-        the episodes' standard deviations, for data in which some agents' observations vary far more; see
+    :param n_heads: number of attention heads
+    :param dropout: probability of dropout in the Transformer. It is 0.2 for fewer than 250 recorded steps for each
+        dimension of the observation, else 0
+    :param chunk_size: number of actions that are predicted at once, H: the newest step's and the next ones (action
+        chunking, Zhao et al., 2023; Chi et al., 2023). Decision Transformer's is 1
+    :param n_action_steps: number of actions that are executed before the next prediction; None is half of the chunk
+    :param return_conditioning: whether the policy learns and acts by the return-to-go; otherwise it clones the recorded
+        actions
+    :param expected_return_steps: number n of recorded rewards in a return-to-go, to which the return expected from there on
+        is added, so that a high target return does not stand for chance (Paster et al., 2022); 0 takes the recorded return.
+        It is 50 where returns predict actions and no number makes up half of the rewards, else 0
+    :param return_range: whether, with `clip_return_to_go`, the return-to-go also stays within the range recorded at similar
+        observations, see :class:`~sb3_dtfm.policies.network.ReturnRange`
+    :param clip_return_to_go: whether the return-to-go stays within the range recorded at the same time step. Then a target
+        return above any episode's, and an episode that falls behind, give inputs like those of training
+    :param return_scaling: scaling of the return-to-go: "timestep" standardises it at each time step, "max" divides it by
+        the largest return, see :class:`~sb3_dtfm.policies.normalization.Normalization`
+    :param film_return_to_go: whether the return-to-go also scales and shifts the input of each Transformer block (FiLM),
+        besides being a token
+    :param observation_scaling: scaling of observations: "std" divides by their standard deviation, "robust" by the lower
+        quartile of the episodes' standard deviations, for data in which some agents' observations vary far more, see
         :meth:`EpisodeTable.statistics`
-    :param features_extractor_class: of images, for each camera: ResidualExtractor, NatureCNN, ResNet18 or another class of
-        SB3's kind, which stands in :data:`~sb3_dtfm.policies.images.EXTRACTORS` by its name
-    :param features_extractor_kwargs: of that class, for example `features_dim`
-    :param normalize_images: divide images by 255, as SB3 does
-    :param share_features_extractor: one extractor for all cameras instead of one each
-    :param timestep_embedding: tell the Transformer the absolute time step, as Decision Transformer does
-    :param tokens_per_step: 3, return-to-go, observation and action, as Decision Transformer does; or 1, the sum of a step's
-        return-to-go, its observation and the action before it: a third of the multiply-accumulates
-    :param critic_steps: with each gradient step, how many a critic takes, which learns what actions are worth so that the
-        best of several can be taken, see :class:`~sb3_dtfm.policies.critic.Critic`; the policy learns as without. It
-        needs a head that draws; 0 for no critic
-    :param gamma: discount of a step for the critic
-    :param expectile: of the critic's value loss, in [0.5, 1)
-    :param n_action_samples: N of best-of-N: actions, or chunks, that are sampled, of which the critic takes one; 1 asks
-        no critic. 8 where there is a critic, if not given
-    :param sample_noise_std: standard deviation of the noise that all but the first of them start from; above 1, which the
-        flow has learned, they differ more, and the critic has more to choose among
-    :param temperature: how much chance that choice leaves, in units of how far actions' values spread in the data; 0
-        takes the one that both values of the critic find better than the first, by the larger gain
-    :param kv_cache: act on the keys and values kept of earlier steps instead of recomputing the window: up to 2.5 times
-        faster, and equal until the window slides (see :func:`~sb3_dtfm.networks.cache.extend`)
+    :param features_extractor_class: network for the images of each camera: ResidualExtractor, NatureCNN, ResNet18, or
+        another features extractor of SB3's kind, which is entered in :data:`~sb3_dtfm.policies.images.EXTRACTORS` by its
+        name
+    :param features_extractor_kwargs: arguments of that class by name, for example `features_dim`
+    :param normalize_images: whether images are divided by 255, as in SB3
+    :param share_features_extractor: whether all cameras share one extractor
+    :param timestep_embedding: whether the Transformer gets an embedding of the time step, as Decision Transformer does
+    :param tokens_per_step: number of tokens a step: 3 for return-to-go, observation and action, as in Decision Transformer,
+        or 1 for the sum of return-to-go, observation and previous action, with a third of the multiply-accumulates
+    :param critic_steps: number of a critic's gradient steps with each of the policy's, which does not depend on it; 0 for
+        no critic. The critic chooses among several samples of DTFM, see :class:`~sb3_dtfm.policies.critic.Critic`
+    :param gamma: discount factor of the critic
+    :param expectile: expectile of the critic's value loss
+    :param n_action_samples: number N of samples for best-of-N, of which the critic takes one; 1 asks no critic. None is 8
+        with a critic, else 1
+    :param sample_noise_std: standard deviation of the noise from which all samples but the first start. It is 1 in
+        training; a larger one makes them differ more
+    :param temperature: temperature of the choice among samples, in standard deviations of the advantages in the data; 0
+        takes the one that both Q-networks prefer to the first sample, by the larger gain
+    :param kv_cache: whether keys and values of earlier steps are kept instead of recomputing the window: up to 2.5 times
+        faster, and equal until the window slides, see :func:`~sb3_dtfm.networks.cache.extend`
     :raises ValueError: an option out of range, by name
     """
 

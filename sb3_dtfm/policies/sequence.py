@@ -118,7 +118,7 @@ class SequencePolicy(BasePolicy):
             if self.network.head.noise_dim == 0:
                 raise ValueError(
                     f"critic_steps={self.options.critic_steps}: the critic has nothing to choose among: "
-                    f"{self.head_class.algorithm} makes one action of what it sees, where DTFM draws."
+                    f"{self.head_class.algorithm} predicts one action for an observation, where DTFM samples."
                 )
             sizes = (self.observation_dim, self.critic_horizon * self.action_dim)
             self.critic = Critic(*sizes, expectile=self.options.expectile)

@@ -227,7 +227,7 @@ def add_repository_arguments(parser: argparse.ArgumentParser) -> None:
     """
     argument = parser.add_argument
     argument("-orga", "--organization", required=True, help="user or organisation on the hub")
-    argument("-name", "--repo-name", metavar="NAME", help="of the repository, ALGO-ENV by default")
+    argument("-name", "--repo-name", metavar="NAME", help="name of the repository, ALGO-ENV by default")
     argument("--repo-folder", type=Path, metavar="FOLDER", help="a folder instead of the hub")
 
 

@@ -50,7 +50,7 @@ def test_every_fault_is_remarked():
     remarks = inspect_buffer(load_dataset(given)).remarks
     assert remarks == [
         "There are 12 episodes: what is learned depends on which ones.",
-        "There twice: 1 episode of 12.",
+        "Stored twice: 1 episode of 12.",
         "Neither terminated nor truncated, the recording just stops: 1 episode of 12.",
         "No episode has any return, so a target return has no effect.",
         "Observations never change in dimensions 1, 3.",
@@ -61,7 +61,7 @@ def test_every_fault_is_remarked():
     far["observations"][5, 2], far["actions"] = 1e6, np.sign(far["actions"])
     far["rewards"][:] = 1.0
     assert inspect_buffer(load_dataset(far)).remarks == [
-        "All returns are 4: the policy copies what it sees, whatever its target return.",
+        "All returns are 4: the policy copies the data, whatever its target return.",
         "Observations go far out in dimension 2: in 2, 110 standard deviations from the mean.",
         "100% of the actions are at a bound.",
     ]
@@ -229,7 +229,7 @@ def test_images_are_named_and_drawn(workplace, capsys):
     text = capsys.readouterr().out
     assert "| images | front 40 x 48 x 3 |" in text
     assert "never change" not in text
-    assert "There twice" not in text
+    assert "Stored twice" not in text
     assert Image.open("dataset.png").size[1] < with_images[1]
     assert main(["inspect", "pixels.npz", "--env", "Pendulum-v1"]) == 2
     assert "holds images front 40 x 48 x 3, hand 1 x 40 x 40; those of Pendulum-v1 are none" in capsys.readouterr().err

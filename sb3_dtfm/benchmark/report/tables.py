@@ -347,7 +347,7 @@ def _changes(base: Group, labelled: Sequence[Group]) -> list[str]:
             seeds = f"{len(runs)}; {len(same)} without" if same and len(same) != len(runs) else str(len(runs))
             rows.append([group.label, settings or NONE, task, f"{data_share:.0%}", algo.upper(), *cells, seeds])
     text = (
-        "What a label's settings did, beside the runs without it of the same seeds: mean ± standard deviation over seeds, "
+        "Effects of a label's settings, beside the runs without it of the same seeds: mean ± standard deviation over seeds, "
         "success in percent or mean return; minutes of training without evaluations; commits of the code that trained them. "
         f"Where these differ, so may the code. {TO_THRESHOLD_IS}"
     )
