@@ -44,7 +44,7 @@ def main(argv: Sequence[str]) -> None:
         restored = restored_arguments(resumed, others)
         if restored is None:
             raise UsageError(
-                f"--resume {resumed}: takes no other arguments but --gym-packages and --conf-file, as a run goes on with "
+                f"--resume {resumed}: takes no other arguments but --gym-packages and --conf-file, as a run resumes with "
                 f"its own; got {' '.join(others)}."
             )
         argv = Start.read(resumed, "finetune").arguments
@@ -92,5 +92,5 @@ def _parser() -> argparse.ArgumentParser:
     argument("--eval-episodes", type=int, default=20, metavar="N", help="episodes of an evaluation; 20 by default")
     argument("--dataset", help=argparse.SUPPRESS)
     argument("--gym-packages", nargs="+", default=[], help=argparse.SUPPRESS)
-    argument("--resume", metavar="RUN", help="go on with an interrupted run of --algo dtfm, as logs/dtfm/HalfCheetah-v5_2")
+    argument("--resume", metavar="RUN", help="resume an interrupted run of --algo dtfm, as logs/dtfm/HalfCheetah-v5_2")
     return parser

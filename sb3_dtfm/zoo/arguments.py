@@ -218,7 +218,7 @@ def train_parser() -> argparse.ArgumentParser:
     offline(
         "--resume",
         metavar="RUN",
-        help="go on with an interrupted run, as logs/dtfm/HalfCheetah-v5_1, with the arguments that it was started with",
+        help="resume an interrupted run, as logs/dtfm/HalfCheetah-v5_1, with the arguments that it was started with",
     )
     shared = parser.add_argument_group("read on the way to RL-Zoo").add_argument
     shared("--algo", default="ppo", help=argparse.SUPPRESS)
@@ -260,7 +260,7 @@ def resumed_run(argv: Sequence[str]) -> tuple[Path | None, list[str]]:
 
 def repeated_arguments(run: Path, started: list[str], others: Sequence[str]) -> list[str]:
     """
-    Arguments for RL-Zoo's `train` of a run that goes on.
+    Arguments for RL-Zoo's `train` of a run that is resumed.
 
     :param run: its folder
     :param started: what it was started with
