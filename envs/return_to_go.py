@@ -210,7 +210,7 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     `EvalCallback` and logs know.
 
     :param env: the environment to wrap
-    :param target_return: of each episode, environment reward units; None takes the model's
+    :param target_return: target return of each episode, environment reward units; None takes the model's
     :param bound_return_to_go: keep that bound; False shows the target less the rewards, as Decision Transformer does
     :raises ValueError: `target_return` is not a finite number, or the observation space cannot be flattened
     """

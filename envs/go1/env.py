@@ -40,8 +40,8 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
         package's own by default
     :param randomize: draw another robot for each episode, add noise to sensors, and push the robot
     :param render_mode: None or "rgb_array"
-    :param width: of `rgb_array` frames, pixels
-    :param height: of `rgb_array` frames, pixels
+    :param width: width of `rgb_array` frames, pixels
+    :param height: height of `rgb_array` frames, pixels
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DECISION)}  # noqa: RUF012

@@ -44,8 +44,8 @@ class RobosuiteEnv(gym.Env[Any, np.ndarray]):
     :param camera_size: height and width of these images, pixels
     :param object_state: observe `object`, too; not given, only without cameras
     :param camera_name: camera of `rgb_array` frames
-    :param width: of `rgb_array` frames, pixels
-    :param height: of `rgb_array` frames, pixels
+    :param width: width of `rgb_array` frames, pixels
+    :param height: height of `rgb_array` frames, pixels
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": CONTROL_FREQUENCY}  # noqa: RUF012

@@ -70,18 +70,18 @@ class SequenceModel(BaseAlgorithm):
 
     :param policy: name or class
     :param env: it acts in, or its Gymnasium id
-    :param options: of training, which are attributes from now on
+    :param options: options of training, which become attributes
     :param learning_rate: further arguments are those of `OfflineAlgorithm`
     :param policy_kwargs: arguments of the policy
     :param tensorboard_log: folder of the TensorBoard log
     :param verbose: 0 silent, 1 prints the log
     :param seed: seed of weights, batches and acting
     :param device: "auto", "cpu" or "cuda"
-    :ivar target_return: for acting, environment reward units; given to each environment of the model that is wrapped
-        without a target. None where a file does not tell
+    :ivar target_return: target return for acting, environment reward units; given to each environment of the model that is
+        wrapped without a target. None if a file does not tell
     :ivar controller: robot, controller and control frequency of the dataset's actions, by robosuite's names, which an
         environment must have, too; None where the data do not tell, or are meant for another environment (`env_id`)
-    :ivar buffer: what it learns from, None where a model only acts
+    :ivar buffer: recorded episodes that it learns from; None if the model only acts
     """
 
     policy: SequencePolicy
@@ -220,10 +220,10 @@ class SequenceModel(BaseAlgorithm):
         """
         Act in another environment from now on.
 
-        :param env: of the model's sizes and range of actions; the bounds of observations may differ, since the policy
-            normalises them itself. It is wrapped as in the constructor, and takes the model's `target_return` where it
-            has no target of its own
-        :param force_reset: as in SB3
+        :param env: environment of the model's sizes and range of actions; the bounds of observations may differ, since the
+            policy normalises them itself. It is wrapped as in the constructor, and takes the model's `target_return` if it
+            has none
+        :param force_reset: whether the environment is reset before the next step, as in SB3
         :raises ValueError: it does not fit
         """
         vec_env = self._wrap_env(env, self.verbose)
@@ -268,7 +268,7 @@ class SequenceModel(BaseAlgorithm):
         Refuse an environment in which an action does something else than in the data.
 
         :param env: wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
-        :param name: of the environment, for messages
+        :param name: name of the environment, for messages
         :raises DatasetError: its robot, controller or control frequency is another than :attr:`controller`
         """
         check_controller(self.controller, env.get_attr("env_args", [0])[0], name)
@@ -293,7 +293,7 @@ class SequenceModel(BaseAlgorithm):
         :param device: "auto", "cpu" or "cuda"
         :param custom_objects: attributes to use in place of those in the file
         :param print_system_info: print what the file was saved with
-        :param force_reset: as in SB3
+        :param force_reset: whether the environment is reset before the next step, as in SB3
         :param allow_pickle: load files in SB3's format, whose pickles run code of their author: for files that you trust
         :param kwargs: attributes to change, `dataset` for example
         :raises ModelFileError: the file is damaged, pickled, of another algorithm, or holds what no model can have
@@ -381,7 +381,7 @@ class SequenceModel(BaseAlgorithm):
 
         :param load_path_or_dict: the file, or what `get_parameters` gives
         :param exact_match: all parameters have to be there, and no others
-        :param device: where they are loaded to
+        :param device: device to load them to
         :raises ModelFileError: the file is damaged, pickled, or of another model
         """
         if not isinstance(load_path_or_dict, dict):
@@ -425,7 +425,8 @@ class SequenceModel(BaseAlgorithm):
 
         :param path: file to write, for example "policy.onnx"
         :param env_id: Gymnasium id for the metadata; by default the environment's, or the dataset's
-        :param target_return: for the metadata, environment reward units; by default the environment's, or the model's
+        :param target_return: target return for the metadata, environment reward units; by default the
+            environment's, or the model's
         :raises ImportError: `sb3-dtfm[export]` is not installed
         :raises OSError: names the path, where what was there before still is
         :raises ValueError: the head does what no graph holds

@@ -83,9 +83,9 @@ class OfflineAlgorithm(SequenceModel):
     :param seed: seed of weights, batches and acting
     :param device: "auto", "cpu" or "cuda"
     :param _init_setup_model: build the network at once
-    :ivar target_return: for acting, environment reward units: the environment's, or where it has none the mean return of the
-        best tenth of the recorded episodes, which `sb3-dtfm inspect` suggests. It is saved with the model, and given to each
-        environment of the model that is wrapped without a target. None where a file does not tell
+    :ivar target_return: target return for acting, environment reward units: the environment's, or where it has none the mean
+        return of the best tenth of the recorded episodes, which `sb3-dtfm inspect` suggests. It is saved with the model, and
+        given to each environment of the model that is wrapped without a target. None if a file does not tell
     :raises ValueError: no dataset, an argument out of range, or an environment that does not fit
     :raises DatasetError: the dataset cannot be read, or does not fit the environment
     """
@@ -167,7 +167,7 @@ class OfflineAlgorithm(SequenceModel):
         """
         Learn from another dataset from now on; normalisation and spaces stay those of the model.
 
-        :param dataset: as in the constructor
+        :param dataset: dataset, as in the constructor
         :raises DatasetError: it cannot be read, or does not fit the model
         """
         self.dataset, self.decisions = dataset, []
@@ -379,7 +379,7 @@ class OfflineAlgorithm(SequenceModel):
     def compute_loss(self, batch: Windows, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """
         :param batch: windows of a buffer, actions in the environment's range, (B, K + H - 1, A) of them
-        :param noise: what the network's `draw_noise` gave for the batch
+        :param noise: noise of the batch, by the network's `draw_noise`
         :return: the loss to minimise, and its parts by their logged names
         """
         seen = batch._replace(observations=self.policy.network.see(batch.observations))

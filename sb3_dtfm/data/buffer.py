@@ -49,14 +49,15 @@ class TrajectoryBuffer(FlatSteps):
         :func:`~sb3_dtfm.actions.to_vectors`
     :ivar rewards: (N,) float32, environment reward units
     :ivar returns_to_go: (N,) float32, environment reward units
-    :ivar image_spaces: of the images, uint8 as they were recorded, by camera; the images themselves are `own(camera)`
+    :ivar image_spaces: spaces of the images, uint8 as they were recorded, by camera; the images themselves are `own(camera)`
     :ivar episodes: the buffer's episodes, one row each
     :ivar weights: (E,) float64, how often a step of each is drawn beside one of weight 1
     :ivar env_id: Gymnasium id of the environment that they come from, None if unknown
     :ivar controller: robot, controller and control frequency that the actions were recorded with, by robosuite's names;
         None where the data do not tell
-    :ivar dropped: how many episodes `on_invalid="drop"` has left out, and why the first of them; None where it had none
-    :ivar device: what batches are made for
+    :ivar dropped: number of episodes that `on_invalid="drop"` has left out, and the reason of the first; None if there
+        is none
+    :ivar device: device of the batches
     """
 
     def __init__(
@@ -113,7 +114,7 @@ class TrajectoryBuffer(FlatSteps):
         :param source: where the episodes come from, for messages
         :param score_reference: scale of the normalised score
         :param env_id: Gymnasium id of the environment that the episodes come from
-        :param storage: where the steps go, memory if not given
+        :param storage: storage of the steps; memory if not given
         :param on_invalid: "raise" for an episode that is refused, or "drop" it, which is counted and warned of
         :param n_stored: bytes of the files that the episodes are read from; episodes that take far more are refused before
             they fill the memory, see :func:`~sb3_dtfm.data.trajectories.check_size`
@@ -204,7 +205,7 @@ class TrajectoryBuffer(FlatSteps):
         they were recorded. See :func:`~sb3_dtfm.data.expected.expected_returns_to_go`.
 
         :param n_steps: n, steps whose rewards count as they came
-        :param seed: of the network that learns what to expect; the same one gives the same numbers
+        :param seed: seed of the network that learns what to expect; an equal one gives equal numbers
         :return: on the same flat tensors, but for the returns-to-go
         """
         rows, timesteps, n_left = self._locate(th.arange(len(self), device=self._stops.device))
@@ -452,7 +453,7 @@ class TrajectoryBuffer(FlatSteps):
         Write the buffer's own steps as flat arrays, which `dataset=` and `--dataset` take; of `weights`, a warning says that
         they are not among them.
 
-        :param path: of the file; `.npz` is added where it is missing
+        :param path: path of the file; `.npz` is added if it is missing
         :raises OSError: it cannot be written; what was there before still is
         """
         path = with_npz(path)

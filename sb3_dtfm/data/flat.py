@@ -156,9 +156,9 @@ def load_flat(
     :param clip_actions: bring actions outside of them to the nearest bound, however far, instead of refusing them
     :param action_space: the environment's
     :param observation_space: the environment's, which tells what is a choice, see :func:`~sb3_dtfm.data.load_dataset`
-    :param max_episode_steps: of the environment
+    :param max_episode_steps: time limit of the environment, steps
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
-    :param storage: where the steps go, memory if not given
+    :param storage: storage of the steps; memory if not given
     :raises DatasetError: no such file, damaged, arrays missing or of lengths that do not fit together, NaN or infinity, or
         actions out of bounds; names the file, the array, the episode and the step
     """

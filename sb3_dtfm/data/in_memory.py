@@ -93,7 +93,7 @@ def load_episodes(
     :param action_space: see :func:`~sb3_dtfm.data.load_flat`
     :param observation_space: see :func:`~sb3_dtfm.data.load_flat`
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
-    :param storage: where the steps go, memory if not given
+    :param storage: storage of the steps; memory if not given
     :raises DatasetError: nothing of the above, arrays missing or of lengths that do not fit together, NaN or infinity, or
         actions out of bounds; names the episode and the step
     """
@@ -279,11 +279,11 @@ def load_replay_buffer(
     are left out if there are finished ones. The first episode of each environment in a full buffer is left out, since its
     beginning has been written over.
 
-    :param replay_buffer: of any number of environments
+    :param replay_buffer: replay buffer of any number of environments
     :param observation_keys: which entries of dictionary observations make up the observation, in this order
     :param clip_actions: bring actions outside of the action space to the nearest bound
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
-    :param storage: where the steps go, memory if not given
+    :param storage: storage of the steps; memory if not given
     :raises DatasetError: no whole episode, an observation space that cannot be flattened, NaN or infinity, or actions
         outside of [-1, 1]; names the environment, the episode and the step
     """

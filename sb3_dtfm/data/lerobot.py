@@ -78,7 +78,7 @@ def load_lerobot(
     :param clip_actions: bring actions outside of them to the nearest bound, however far, instead of refusing them
     :param action_space: the environment's
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
-    :param storage: where the steps go, memory if not given
+    :param storage: storage of the steps; memory if not given
     :raises DatasetError: files missing or damaged, other numbers of episodes or frames than `meta/info.json` tells of, NaN
         or infinity, or actions out of bounds; names the folder, the feature, the episode and the step
     """

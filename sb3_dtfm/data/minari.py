@@ -102,7 +102,7 @@ def load_minari(
     :param observation_keys: which entries of dictionary observations, cameras too, make up the observation, in this order
     :param clip_actions: bring actions outside of the dataset's action space to the nearest bound
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
-    :param storage: where the steps go, memory if not given
+    :param storage: storage of the steps; memory if not given
     :return: its episodes, with the normalised-score scale of its metadata where it names one
     :raises DatasetError: neither found nor downloaded, damaged, or not fit for learning (names the file, episode and field)
     """

@@ -182,7 +182,7 @@ def load_dataset(
     :param success_only: keep the successes alone, by what the data say of each episode's last step; see
         :attr:`TrajectoryBuffer.successes`
     :param fraction: keep this share of the episodes, randomly drawn
-    :param fraction_seed: of that draw alone, so that different runs learn from the same episodes
+    :param fraction_seed: seed of that draw alone, so that different runs learn from the same episodes
     :param allow_pickle: read pickles, which can run code: files of SB3's replay buffers (`.pkl`), and arrays of objects in
         `.npz`; not accepted from `dataset_kwargs`, which files of others may hold
     :param kwargs: options of the reader: `on_invalid`, which is "raise" unless "drop" leaves episodes out that would be

@@ -108,7 +108,7 @@ def load_robomimic(
     :param env_args: `RobosuiteEnv.env_args` of the environment whose robot and controller have to be the file's; by default
         those of the registered ones
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
-    :param storage: where the steps go, memory if not given
+    :param storage: storage of the steps; memory if not given
     :return: actions in the controller's input range, or in that of `action_bounds` or `action_space`; [-1, 1] if nothing
         tells
     :raises DatasetError: no such file, not readable, nothing in it, unknown keys, wrong shapes, NaN or infinity, or actions
@@ -251,7 +251,7 @@ def check_controller(
 
     :param controller: of the data, see :class:`~sb3_dtfm.data.TrajectoryBuffer`; None where they do not tell
     :param env_args: the environment's, see :func:`load_robomimic`; None where it does not tell
-    :param name: of the environment, for messages
+    :param name: name of the environment, for messages
     :param source: of the data, for messages; None for those of a model
     :raises DatasetError: robot, controller or control frequency differ
     """

@@ -118,7 +118,7 @@ class Trajectory:
     :param truncated: the last step hit a time limit; neither flag set means that the recording stopped mid-episode
     :param success: whether the task was done at the last step; None where the data do not tell
     :param images: by camera, (T, height, width, channels) uint8, or channels first
-    :param name: what the file calls this episode, for error messages
+    :param name: name of the episode in its file, for error messages
     """
 
     observations: np.ndarray

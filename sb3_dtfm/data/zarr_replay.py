@@ -150,7 +150,7 @@ def load_zarr(
     :param action_space: see :func:`~sb3_dtfm.data.load_flat`
     :param observation_space: the environment's
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
-    :param storage: where the steps go, memory if not given
+    :param storage: storage of the steps; memory if not given
     :raises ImportError: `sb3-dtfm[zarr]` is not installed
     :raises DatasetError: none such, damaged, arrays missing or of lengths that do not fit together, NaN or infinity, or
         actions out of bounds; names array, episode and step

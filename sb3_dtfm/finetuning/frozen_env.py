@@ -31,7 +31,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
 
     :param venv: environments wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
     :param model: a DTFM, or the path to a saved one
-    :param bound: how far the choice may go
+    :param bound: largest absolute value of a choice
     :param hidden_state: show the Transformer's hidden state as well
     :raises ValueError: a model that has an online actor already or does not fit, environments that do not fit, or an
         argument out of range

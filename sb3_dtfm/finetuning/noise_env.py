@@ -27,7 +27,7 @@ class NoiseSpace(spaces.Box):
 
     :param noise_dim: N
     :param bound: largest absolute value
-    :param seed: of the samples
+    :param seed: seed of the samples
     """
 
     def __init__(self, noise_dim: int, bound: float = NOISE_BOUND, seed: int | None = None) -> None:

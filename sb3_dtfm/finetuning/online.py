@@ -74,7 +74,7 @@ class OnlineDTFM(DTFM):
     one: `OnlineDTFM.load("can.zip", env, dataset="can.hdf5")` goes on from a DTFM, and `DTFM.load` reads what it saves.
 
     :param n_episodes: own episodes of a round, of all environments together
-    :param gradient_steps: of a round, over which `learning_rate_schedule` and `warmup_steps` go
+    :param gradient_steps: number of gradient steps in a round, over which `learning_rate_schedule` and `warmup_steps` go
     :ivar replay_buffer: all own episodes, None before the first ones
     """
 
@@ -236,7 +236,7 @@ class OnlineDTFM(DTFM):
         """
         Write the own episodes as flat arrays, which `dataset=` takes, too.
 
-        :param path: of the file; `.npz` is added where it is missing
+        :param path: path of the file; `.npz` is added if it is missing
         :raises ValueError: there are none yet
         :raises OSError: it cannot be written
         """
@@ -248,7 +248,7 @@ class OnlineDTFM(DTFM):
         """
         Take up own episodes of an earlier run.
 
-        :param path: what :meth:`save_replay_buffer` was given
+        :param path: path that :meth:`save_replay_buffer` was given
         :param truncate_last_traj: SB3's; episodes that had not ended are not there
         :raises DatasetError: it cannot be read, or does not fit the model
         """

@@ -70,7 +70,7 @@ class ActionHead(nn.Module, ABC):
         :param hidden: (B, K, D)
         :param actions: (B, K, A) in [-1, 1]
         :param mask: (B, K) bool, False on padded steps
-        :param noise: what :meth:`draw_noise` gave
+        :param noise: noise of :meth:`draw_noise`
         :return: the loss to minimise, a mean over valid steps, and its parts by their logged names
         """
 

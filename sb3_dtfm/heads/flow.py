@@ -100,7 +100,7 @@ class FlowHead(ActionHead):
 
     :param embed_dim: D
     :param action_dim: A
-    :param options: of :class:`FlowOptions`
+    :param options: options of :class:`FlowOptions`
     """
 
     algorithm = "DTFM"

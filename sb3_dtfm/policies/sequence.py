@@ -59,7 +59,7 @@ class SequencePolicy(BasePolicy):
     :param weight_decay: AdamW's, on weight matrices only
     :param ema: keep an exponential moving average of the weights and act with it
     :param seed: seed of the noise that acting starts from
-    :param options: of :class:`~sb3_dtfm.policies.options.PolicyOptions` and of the head
+    :param options: options of :class:`~sb3_dtfm.policies.options.PolicyOptions` and of the head
     :raises ValueError: an argument out of range or unknown, by name, or an action space that the head does not learn
     """
 
@@ -197,7 +197,7 @@ class SequencePolicy(BasePolicy):
 
     def set_weight_decay(self, weight_decay: float) -> None:
         """
-        :param weight_decay: of weight matrices from the next gradient step on
+        :param weight_decay: weight decay of weight matrices, from the next gradient step on
         """
         self.optimizer.param_groups[0]["weight_decay"] = self.weight_decay = weight_decay
 
@@ -205,7 +205,7 @@ class SequencePolicy(BasePolicy):
         """
         torch's, for a policy with or without a moving average whatever was saved: one that begins starts from the weights.
 
-        :param state_dict: of a policy like this one
+        :param state_dict: state of a policy like this one
         :param strict: as in torch
         :param assign: as in torch
         """
@@ -289,7 +289,7 @@ class SequencePolicy(BasePolicy):
 
         :param observation: Dict of `observation` (O,), `return_to_go` (1,), `timestep` (1,), or with a leading axis B, and
             images by camera, channels first or last
-        :param state: what the last call returned
+        :param state: state that the last call returned
         :param episode_start: (B,) bool, True where an environment was just reset
         :param deterministic: repeat exactly for the same model, state and inputs; otherwise draw fresh noise
         :return: actions (A,) or (B, A) in the environment's range, of a Discrete space () or (B,), and the next state
@@ -356,7 +356,7 @@ class SequencePolicy(BasePolicy):
         A pure function, as `predict` with a `state`.
 
         :param observation: as for :meth:`predict`
-        :param state: what :meth:`decode` or :meth:`predict` returned; None for no past
+        :param state: state that :meth:`decode` or :meth:`predict` returned; None for no past
         :param episode_start: (B,) bool, True where an environment was just reset
         :return: the context with the newest step, and the Transformer's hidden states (B, D)
         :raises ValueError: as :meth:`predict`
@@ -376,7 +376,7 @@ class SequencePolicy(BasePolicy):
         """
         The second half: what this noise leads to. Whatever was planned before is dropped.
 
-        :param context: what :meth:`encode` returned, with `hidden`
+        :param context: context that :meth:`encode` returned with `hidden`
         :param hidden: (B, D)
         :param noise: (B, N), for the head's `noise_dim`
         :return: actions of this step and of those planned, (B, n_action_steps, A) in the environment's range, and the next
@@ -392,7 +392,7 @@ class SequencePolicy(BasePolicy):
         """
         The noise that `predict(deterministic=True)` begins with.
 
-        :param context: what :meth:`encode` returned
+        :param context: context that :meth:`encode` returned
         :return: (B, N)
         """
         return self._acting_noise(context.timesteps[:, -1] + context.episode_keys, deterministic=True).cpu().numpy()
@@ -401,7 +401,7 @@ class SequencePolicy(BasePolicy):
         """
         Carry out actions that an online algorithm has chosen.
 
-        :param context: what :meth:`encode` returned
+        :param context: context that :meth:`encode` returned
         :param chunks: (B, h, A) in [-1, 1], for at least the `n_action_steps` that are carried out
         :return: as :meth:`decode`
         :raises ValueError: they are not finite

@@ -84,7 +84,7 @@ def record_agent(
     :param vec_normalize_path: the agent's VecNormalize statistics, a pickle file, which can run code; those of its run by
         default, and "none" insists that it has none
     :param env_kwargs: arguments of ``gymnasium.make``, beside those of the agent's run
-    :param device: where the agent's network runs
+    :param device: device of the agent's network
     :param env_wrapper: class, with its module, of the wrapper that the agent sees the environment through; that of its run
         by default
     :param picture_size: record what the environment renders, too, as :class:`~sb3_dtfm.envs.RenderWrapper` shows it in this

@@ -80,7 +80,7 @@ def record_demonstrations(
     :param task: one of :func:`demonstrated_tasks`
     :param n_episodes: successful episodes to record
     :param output: the hdf5 file; it appears under this name when it is complete
-    :param seed: of starts and demonstrators
+    :param seed: seed of initial states and demonstrators
     :param n_workers: processes to simulate in; the number of CPU cores by default, and 1 stays in this process
     :param overwrite: replace an existing file
     :param progress: show a progress bar with the success rate
