@@ -21,7 +21,7 @@ class TrainingOptions(Options):
     Options of the windows that are drawn, and of the gradient steps that learn from them.
 
     :param batch_size: number of windows in a gradient step, of all processes together. It is 64 for fewer than 10,000
-        recorded steps, else 256
+        recorded steps or with images, else 256
     :param context_length: number of steps that the policy observes, K
     :param return_weighting: weight w of good episodes: a step of the best one is drawn 1 + w times as often as one of the
         worst, others in between by their returns (Yue et al., 2022); 0 draws all alike. It is 5 where returns predict

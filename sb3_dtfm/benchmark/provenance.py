@@ -20,6 +20,7 @@ from sb3_dtfm.data import TrajectoryBuffer, load_dataset, without_pickles
 from sb3_dtfm.data.inspection import BEST_SHARE, return_reference
 from sb3_dtfm.data.minari import is_minari, open_minari
 from sb3_dtfm.optimization import multiplies_bfloat16
+from sb3_dtfm.zoo.arguments import with_target_return
 
 PACKAGES = ("sb3-dtfm", "torch", "stable-baselines3", "rl_zoo3", "gymnasium", "mujoco", "robosuite", "numpy")
 GIT_TIMEOUT = 20  # seconds
@@ -77,17 +78,35 @@ def _cpu_name() -> str:
 
 def read_data(env_id: str, settings: dict[str, Any]) -> TrajectoryBuffer:
     """
-    All episodes of a run's dataset, as `train` reads them: up to the time limit of its environment.
+    All episodes of a run's dataset, as `train` reads them.
 
     :param env_id: Gymnasium id
-    :param settings: of the run; `dataset`, `dataset_kwargs` and `env_kwargs` count
+    :param settings: settings of the run; `dataset`, `dataset_kwargs`, `env_wrapper` and `env_kwargs` count
     :raises DatasetError: it cannot be read, or was recorded on another task; versions may differ
     """
-    with contextlib.closing(gym.make(env_id, **(settings.get("env_kwargs") or {}))) as env:
-        limit = None if env.spec is None else env.spec.max_episode_steps
-        known = {"observation_space": env.observation_space, "action_space": env.action_space, "max_episode_steps": limit}
-    buffer = load_dataset(settings["dataset"], **{**known, **without_pickles(settings.get("dataset_kwargs"))})
-    buffer.check_task(env_id)
+    from rl_zoo3.utils import get_wrapper_class  # an extra
+
+    wrap = get_wrapper_class({"env_wrapper": with_target_return(None, settings.get("env_wrapper"))})
+    assert wrap is not None
+    with contextlib.closing(wrap(gym.make(env_id, **(settings.get("env_kwargs") or {})))) as env:
+        return read_for(env, settings["dataset"], **without_pickles(settings.get("dataset_kwargs")))
+
+
+def read_for(env: gym.Env, dataset: Any, **options: Any) -> TrajectoryBuffer:
+    """
+    All episodes of a dataset, as `train` reads them for an environment: up to its time limit.
+
+    :param env: environment in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
+    :param dataset: dataset, see :func:`~sb3_dtfm.data.load_dataset`
+    :param options: further arguments of that function
+    :raises DatasetError: it cannot be read, or was recorded on another task; versions may differ
+    """
+    task = env.get_wrapper_attr("known_task")
+    known = {"observation_space": env.get_wrapper_attr("recorded_space"), "action_space": env.action_space}
+    known |= {"max_episode_steps": task and task.max_episode_steps, "env_args": env.get_wrapper_attr("env_args")}
+    buffer = load_dataset(dataset, **{**known, **options})
+    if task is not None:
+        buffer.check_task(task.env_id)
     return buffer
 
 

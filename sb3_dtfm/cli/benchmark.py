@@ -18,7 +18,7 @@ examples:
 
 The file of --datasets maps a task to its dataset, or to some of these keys:
   task            Gymnasium id, where the entry has a name of its own: several entries may have the same task
-  dataset         Minari id, robomimic file or flat arrays; the profile's by default
+  dataset         Minari id, file or folder; the profile's by default
   target_return   in reward units; what `sb3-dtfm inspect` suggests of the dataset by default
   recorded_from   the agent or demonstrator, for the report
   env_kwargs      of the environment
@@ -68,15 +68,17 @@ def benchmark_parser() -> argparse.ArgumentParser:
     grid("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import first, which register tasks")
     grid("--label", default="", help="name of what -params change; part of a run's identity")
     data = parser.add_argument_group("data").add_argument
-    data("--dataset", **several, metavar="TASK=DATASET", help="Minari id, robomimic file or flat arrays")
+    data("--dataset", **several, metavar="TASK=DATASET", help="Minari id, file or folder")
     data("--datasets", metavar="FILE", help="YAML file with entries for many tasks, see below")
     data("--dataset-cache", metavar="DIR", help="learn from memory-mapped files made in this folder")
-    data("--target-return", **several, metavar="[TASK=]RETURN", help="when acting, in reward units")
+    data("--target-return", **several, metavar="[TASK=]RETURN", help="target return, in reward units")
     training = parser.add_argument_group("training and evaluation").add_argument
     training("-n", "--n-timesteps", type=int, metavar="N", help="gradient steps; the profile's by default")
     training("-params", "--hyperparams", **several, metavar="KEY:VALUE", help="settings to change; needs --label")
-    training("--eval-freq", type=int, metavar="N", help=f"gradient steps between; 1/{N_EVALUATIONS} of all by default")
-    training("--eval-episodes", type=int, default=20, metavar="N", help="episodes of each; 20 by default")
+    training(
+        "--eval-freq", type=int, metavar="N", help=f"gradient steps between evaluations; 1/{N_EVALUATIONS} of all by default"
+    )
+    training("--eval-episodes", type=int, default=20, metavar="N", help="episodes of each evaluation; 20 by default")
     training("--final-episodes", type=int, default=50, metavar="N", help="episodes after the last step; 50 by default")
     training("--n-eval-envs", type=int, default=10, metavar="N", help="environments side by side; 10 by default")
     training("--env-kwargs", **several, metavar="KEY:VALUE", help="arguments of the environment, as in train")

@@ -1,13 +1,14 @@
 """`sb3-dtfm sweep`: the return that models reach against their target return."""
 
 import argparse
-import functools
+import contextlib
 import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
@@ -15,7 +16,7 @@ from tqdm import tqdm
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.evaluation import SeededEpisodes, evaluate
-from sb3_dtfm.benchmark.provenance import commit, read_data, versions
+from sb3_dtfm.benchmark.provenance import commit, read_for, versions
 from sb3_dtfm.benchmark.report.statistics import Interval, student_t
 from sb3_dtfm.envs import ReturnToGoWrapper
 from sb3_dtfm.files import replacing
@@ -60,9 +61,12 @@ def main(argv: Sequence[str]) -> None:
     import_packages(options.gym_packages)
     algorithms = [options.algo or algorithm_of(model) for model in options.models]
     agents = [find_agent(model, options.env) for model in options.models]
-    given = {"dataset": options.dataset, "dataset_kwargs": key_values("--dataset-kwargs", options.dataset_kwargs)}
-    given["env_kwargs"] = {**agents[0].env_kwargs, **key_values("--env-kwargs", options.env_kwargs)}
-    returns = read_data(options.env, given).episode_returns
+    known, dataset_kwargs = (
+        max(agents, key=lambda agent: agent.of_run),
+        key_values("--dataset-kwargs", options.dataset_kwargs),
+    )
+    with contextlib.closing(_wrapper(known)(gym.make(options.env, **_env_kwargs(known, options)))) as env:
+        returns = read_for(env, options.dataset, **dataset_kwargs).episode_returns
     models = [load_agent(algo, agent.model, "cpu") for algo, agent in zip(algorithms, agents, strict=True)]
     acting = key_values("--acting", options.acting)
     for model in models:
@@ -152,6 +156,16 @@ def evenly(returns: np.ndarray, n: int) -> list[float]:
     return np.unique([float(f"{each:.4g}") for each in np.linspace(returns.min(), returns.max(), n)]).tolist()
 
 
+def _env_kwargs(agent: AgentFiles, options: argparse.Namespace) -> dict[str, Any]:
+    """Arguments of the environment that an agent was trained in, with the command's changes."""
+    return {**agent.env_kwargs, **key_values("--env-kwargs", options.env_kwargs)}
+
+
+def _wrapper(agent: AgentFiles) -> Callable[[gym.Env], gym.Env]:
+    """Wrapper of an agent's environment; targets follow."""
+    return agent.wrapper or ReturnToGoWrapper
+
+
 def sweep(
     model: BaseAlgorithm, agent: AgentFiles, options: argparse.Namespace, targets: Sequence[float], progress: tqdm
 ) -> list[Reached]:
@@ -164,12 +178,11 @@ def sweep(
     :param targets: target returns, environment reward units
     :param progress: counts episodes
     """
-    wrap = agent.wrapper or functools.partial(ReturnToGoWrapper, target_return=targets[0])
     vec_env = make_vec_env(
         options.env,
         min(options.n_envs, options.episodes),
-        wrapper_class=lambda env: SeededEpisodes(wrap(env)),
-        env_kwargs={**agent.env_kwargs, **key_values("--env-kwargs", options.env_kwargs)},
+        wrapper_class=lambda env: SeededEpisodes(_wrapper(agent)(env)),
+        env_kwargs=_env_kwargs(agent, options),
     )
     model.check_controller(vec_env)  # type: ignore[attr-defined]
     first = first_state(options)

@@ -206,7 +206,10 @@ class _InMemory(Arrays):
 
     def describe(self, name: str) -> tuple[tuple[int, ...], np.dtype] | None:
         found = self._arrays[name]
-        return (found.shape, found.dtype) if isinstance(found, np.ndarray) else None
+        with contextlib.suppress(Exception):  # lists of different lengths, which are not read
+            array = np.asarray(None if isinstance(found, Mapping) else found)
+            return (array.shape, array.dtype) if array.dtype != object else None
+        return None
 
 
 class _Table(Arrays):

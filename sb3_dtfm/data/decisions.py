@@ -77,7 +77,11 @@ def decide_open(buffer: TrajectoryBuffer, names: set[str], given: Mapping[str, A
         names.discard("expected_return_steps")
     if given.get("regression_coef") == 0 or given.get("critic_steps"):  # no mean action; a choice among draws
         names.discard("flow_steps")
-    return [each for each in decide(buffer) if each.name in names]
+    decisions = [each for each in decide(buffer) if each.name in names]
+    if given.get("return_conditioning") is False:  # behaviour cloning, of all episodes alike
+        alike = Decision("return_weighting", 0.0, "return_conditioning=False learns from all episodes alike.")
+        decisions = [alike if each.name == alike.name else each for each in decisions]
+    return decisions
 
 
 def sentences(decisions: list[Decision]) -> list[str]:

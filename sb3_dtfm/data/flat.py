@@ -31,6 +31,7 @@ OBSERVATIONS = ("observations", "observation", "obs", "states", "state")
 ACTIONS = ("actions", "action", "acts")
 REWARDS = ("rewards", "reward", "rews")
 SUCCESSES = ("successes", *SUCCESS, *(f"infos/{name}" for name in SUCCESS))
+ENDS_OF_EPISODES = {*TERMINATIONS, *TRUNCATIONS, *DONES, *EPISODES, ENDS, LENGTHS}
 # Arrays that TrajectoryBuffer.save adds, beside ENV_ID.
 LOW, HIGH = "action_low", "action_high"
 # Arrays that files often hold, and that add no information.
@@ -50,8 +51,7 @@ def warn_of_made_up_rewards(
     names = set(names)
     if names & set(REWARDS):
         return
-    ends = {*TERMINATIONS, *TRUNCATIONS, *DONES, *EPISODES, ENDS, LENGTHS}
-    read = {*OBSERVATIONS, *ACTIONS, *ends, *SUCCESSES, LOW, HIGH, ENV_ID, *NOT_NEEDED}
+    read = {*OBSERVATIONS, *ACTIONS, *ENDS_OF_EPISODES, *SUCCESSES, LOW, HIGH, ENV_ID, *NOT_NEEDED}
     unread = sorted(name for name in names - read if not name.startswith(("infos/", STORED_IMAGE)))
     told = names & set(SUCCESSES)
     if told and not unread:
@@ -167,7 +167,7 @@ def load_flat(
         actions = _actions(arrays, action_keys, action_space)
         images = [name for name in arrays.names if str(name).startswith(STORED_IMAGE)]
         alone = images and not arrays.has(OBSERVATIONS)
-        entries = [] if observation_keys else _entries(arrays, observation_space)
+        entries = [] if observation_keys else _entries(arrays, observation_space, action_keys)
         keys = list(observation_keys or entries or ([] if alone else arrays.columns(OBSERVATIONS)))
         if observation_keys is None and not entries:
             keys += images
@@ -178,14 +178,19 @@ def load_flat(
         return _read(arrays, observations, actions, ends, action_bounds, clip_actions, action_space, on_invalid, storage)
 
 
-def _entries(arrays: Arrays, space: spaces.Space | None) -> list[str]:
-    """An environment's entries, if each has an array of its name and its size."""
+def _entries(arrays: Arrays, space: spaces.Space | None, others: Collection[str]) -> list[str]:
+    """Arrays of an environment's entries, sorted by the entry, if each has one of its name and its size."""
     parts = space.spaces if isinstance(space, spaces.Dict) else {}
-    for name, part in parts.items():
-        found = arrays.describe(name) if name in arrays.names else None
-        if found is None or part.shape is None or math.prod(found[0][1:]) != math.prod(part.shape):
+    others = {*others, *ACTIONS, *REWARDS, *SUCCESSES, *ENDS_OF_EPISODES}
+    keys = []
+    for entry, part in sorted(parts.items()):
+        name = entry if entry in arrays.names else f"{STORED_IMAGE}{entry}"
+        shape, _ = (arrays.describe(name) if name in arrays.names else None) or (None, None)
+        sizes = () if part.shape is None else (math.prod(part.shape), spaces.flatdim(part))
+        if shape is None or entry in others or math.prod(shape[1:]) not in sizes:
             return []
-    return sorted(parts)
+        keys.append(name)
+    return keys
 
 
 def _warn_of_images(arrays: Arrays, others: Collection[str], n_steps: int) -> None:
@@ -281,12 +286,13 @@ def _observations(arrays: Arrays, keys: Sequence[str], n_steps: int, space: spac
         name = arrays.name(OBSERVATIONS)
         parts = {name: observed(arrays.stored(name), keys, space, f"{arrays.source}: {name}")}
     else:
-        known = {key: part_of(space, key) or (space if key in OBSERVATIONS else None) for key in keys}
+        own_parts = {key: part_of(space, key) for key in keys}
+        known = {key: space if part is None and key in OBSERVATIONS else part for key, part in own_parts.items()}
         stored = {key: arrays.stored(arrays.name((key,))) for key in keys}
         parts = {key: observed(stored[key], None, known[key], f"{arrays.source}: {key}") for key in keys}
     images: dict[str, np.ndarray] = {}
     for name, part in parts.items():
-        own = name if name not in OBSERVATIONS else IMAGE
+        own = name if name not in OBSERVATIONS or part_of(space, name) is not None else IMAGE
         images |= {
             own.removeprefix(STORED_IMAGE) if camera == IMAGE else camera: each for camera, each in part.images.items()
         }

@@ -200,7 +200,7 @@ def train_parser() -> argparse.ArgumentParser:
     offline(
         "--dataset",
         nargs="+",
-        help="Minari id, robomimic hdf5 file, or .npz or hdf5 file of flat arrays to learn from; or several",
+        help="Minari id, file or folder to learn from; or several",
     )
     offline("--dataset-fraction", type=float, help="randomly drawn share of the episodes, in (0, 1]")
     offline("--dataset-cache", metavar="DIR", help="learn from memory-mapped files made in this folder")

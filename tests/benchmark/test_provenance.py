@@ -12,6 +12,7 @@ from gymnasium import spaces
 
 from sb3_dtfm.benchmark import provenance
 from sb3_dtfm.data import DatasetError, load_dataset
+from sb3_dtfm.envs import register_gymnasium_robotics
 from tests.recorded import DATASET_ID
 
 
@@ -84,6 +85,18 @@ def test_choices_are_read_as_the_environment_has_them(tmp_path):
     assert buffer.action_space == spaces.Discrete(4)
     np.testing.assert_array_equal(buffer.observations.argmax(axis=1), states)
     assert buffer.observation_space.shape == (48,)
+
+
+def test_a_wrapper_of_the_run_says_what_was_recorded(tmp_path):
+    register_gymnasium_robotics()
+    with h5py.File(tmp_path / "maze.hdf5", "w") as file:
+        file["observations/observation"], file["episode_ends"] = np.ones((4, 4)), [4]
+        file["actions"], file["rewards"] = np.zeros((4, 2)), np.zeros(4)
+    settings = {"dataset": str(tmp_path / "maze.hdf5")}
+    with pytest.raises(DatasetError, match="has no achieved_goal, desired_goal, which the environment observes"):
+        provenance.read_data("PointMaze_UMaze-v3", settings)
+    settings["env_wrapper"] = [{"gymnasium.wrappers.FilterObservation": {"filter_keys": ["observation"]}}]
+    assert provenance.read_data("PointMaze_UMaze-v3", settings).observation_space.shape == (4,)
 
 
 def test_a_dataset_that_cannot_be_read_is_refused(tmp_path):

@@ -7,7 +7,7 @@ from gymnasium import spaces
 
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import Trajectory, TrajectoryBuffer
-from sb3_dtfm.data.decisions import DECIDED, decide, sentences
+from sb3_dtfm.data.decisions import DECIDED, decide, decide_open, sentences
 from sb3_dtfm.data.predictability import correlation_of_changes, prediction_errors
 
 SPACE = spaces.Box(-1.0, 1.0, (2,))
@@ -81,6 +81,14 @@ def test_returns_count_where_they_tell_how_an_episode_acts(kind, expected):
     assert (
         tuple(decided.get(name) for name in ("return_conditioning", "return_weighting", "expected_return_steps")) == expected
     )
+
+
+def test_cloning_learns_from_all_episodes_alike():
+    buffer, names = make_buffer("several agents"), {"return_weighting", "expected_return_steps", "batch_size"}
+    cloning = {each.name: each.value for each in decide_open(buffer, names, {"return_conditioning": False})}
+    assert cloning == {"return_weighting": 0.0, "batch_size": settings(buffer)["batch_size"]}
+    weighted = decide_open(buffer, names, {"return_conditioning": False, "return_weighting": 2.0})
+    assert "return_weighting" not in {each.name for each in weighted}
 
 
 def test_returns_are_not_expected_where_a_reward_tells_of_success_alone():

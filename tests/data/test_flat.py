@@ -158,6 +158,45 @@ def test_arrays_by_the_names_of_an_environment_s_entries_are_the_observation(sou
     for change in ({"pressed": None}, {"observation": np.ones((N, 3))}):
         others = load_dataset(source(path, **{**parts, **change}), observation_space=ENTRIES)
         np.testing.assert_allclose(others.observations, arrays()["observations"], rtol=1e-6)
+    flattened = load_dataset(source(path, **{**read, "pressed": one_hot}), observation_space=ENTRIES)
+    np.testing.assert_array_equal(flattened.observations, expected)
+
+
+@pytest.mark.parametrize("source", [write, lambda path, **changes: arrays(**changes)], ids=["npz", "memory"])
+@pytest.mark.parametrize("name", ["front", "image:front"])
+def test_an_entry_may_be_a_camera(source, name, path):
+    frames = np.zeros((N, 6, 5, 3), np.uint8)
+    space = spaces.Dict(
+        front=spaces.Box(0, 255, (6, 5, 3), np.uint8), state=spaces.Box(-9, 9, (2,)), goal=spaces.Box(-9, 9, (1,))
+    )
+    read = {"observations": None, name: frames, "state": np.ones((N, 2)), "goal": np.zeros((N, 1))}
+    buffer = load_dataset(source(path, **read), observation_space=space)
+    assert list(buffer.image_spaces) == ["front"]
+    np.testing.assert_array_equal(buffer.observations, [[0, 1, 1]] * N)
+
+
+def test_an_entry_may_be_called_as_observations_often_are(path):
+    frames = np.zeros((N, 6, 5, 3), np.uint8)
+    space = spaces.Dict(obs=spaces.Box(0, 255, (6, 5, 3), np.uint8), where=spaces.MultiDiscrete([[2, 3]]))
+    read = {"observations": None, "obs": frames, "where": np.ones((N, 1, 2), int)}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert list(load_dataset(write(path, **read), observation_space=space).image_spaces) == ["obs"]
+
+
+def test_what_is_learned_is_no_entry(path):
+    """An environment may observe its last action; the array of that name holds the next one."""
+    space = spaces.Dict(observations=spaces.Box(-9, 9, (3,)), actions=spaces.Box(-1, 1, (2,)))
+    np.testing.assert_allclose(
+        load_dataset(write(path), observation_space=space).observations, arrays()["observations"], rtol=1e-6
+    )
+
+
+def test_lists_are_entries_too():
+    """Steps that were appended to lists; an array that is not read may be ragged."""
+    lists = dict(observation=[[1.0, 2.0]] * N, desired_goal=[[3.0]] * N, pressed=[1] * N, ragged=[[1], [1, 2]] * 5)
+    buffer = load_dataset({**arrays(observations=None), **lists}, observation_space=ENTRIES)
+    np.testing.assert_array_equal(buffer.observations, [[3, 1, 2, 0, 1, 0]] * N)
 
 
 def hdf5(path, **changes):
