@@ -2,7 +2,7 @@
 A study's table as a picture: a line for each row, dots for the numbers of a column, bars for their intervals.
 
     python studies/dots.py docs/studies/adroit.md recorded DT DTFM --label "episodes solved, of 100"
-    python studies/dots.py docs/studies/expected-returns.md happened expected 0.95 --label "mean return"
+    python studies/dots.py docs/studies/expected-returns.md recorded expected 0.95 --label "mean return"
     python studies/dots.py docs/studies/ogbench.md mean published --label "success on average of five tasks, %"
     python studies/dots.py docs/studies/pusht.md solved --label "episodes solved, %"
 

@@ -255,7 +255,7 @@ def test_values_are_logged(cheetah_buffer):
 
 
 def test_what_cannot_choose_says_why(cheetah_buffer):
-    with pytest.raises(ValueError, match="critic_steps=1: the critic has nothing to choose among: DT makes one action"):
+    with pytest.raises(ValueError, match="critic_steps=1: the critic has nothing to choose among: DT predicts one action"):
         make_model(DT, cheetah_buffer, policy_kwargs=dict(critic_steps=1))
     with pytest.raises(
         ValueError, match=r"n_action_samples=4 needs a model that was trained with policy_kwargs=dict\(critic_steps="
