@@ -258,7 +258,7 @@ def test_help_lists_every_parameter_those_of_policy_and_head_too(algorithm):
 def test_the_constructor_takes_each_option_of_training_with_its_default(cheetah_buffer):
     taken = {name: parameter.default for name, parameter in inspect.signature(OfflineAlgorithm).parameters.items()}
     defaults = TrainingOptions.defaults()
-    assert {name: taken[name] for name in defaults} == defaults
+    assert [(name, default) for name, default in taken.items() if name in defaults] == list(defaults.items()), "in order"
     given = {name: {int: 2, float: 0.5}.get(type(default), default) for name, default in defaults.items()}
     model = make_model(DT, cheetah_buffer, **given | {"batch_size": 8})
     assert TrainingOptions.of(vars(model)) == TrainingOptions(**given | {"batch_size": 8, "return_weighting": 0.0})
