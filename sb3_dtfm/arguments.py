@@ -227,7 +227,7 @@ def documented_parameters(*described: type, order: Iterable[str] = (), decided: 
     found: dict[str, str] = {}
     for each in described:
         defaults = each.defaults() if issubclass(each, Options) else {}
-        rules = {each.name: each.metadata["rule"] for each in dataclasses.fields(each)} if defaults else {}
+        rules = {field.name: field.metadata["rule"] for field in dataclasses.fields(each)} if defaults else {}
         text = inspect.cleandoc(each.__doc__ or "")
         for name, entry in re.findall(r"^:param (\w+):(.*?)(?=^:|\Z)", text, re.DOTALL | re.MULTILINE):
             default = "decided from the data" if name in decided else repr(defaults.get(name))
