@@ -9,10 +9,14 @@ simulation of docs/howto/go1.md. `Robot` is what hardware code implements; `Simu
 """
 
 import argparse
+import contextlib
+import signal
+import sys
 import threading
 import time
+from collections.abc import Iterator
 from types import TracebackType
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, NoReturn, Protocol
 
 import numpy as np
 from deploy import Policy
@@ -32,6 +36,8 @@ OLDEST = 0.04  # seconds, age of a measurement
 STEEPEST = 0.5  # cosine of the trunk's tilt
 FASTEST = 30.0  # rad/s, of a joint
 STANDING_UP = 2.0  # seconds
+RAMP = 1.0  # seconds in which the command grows from and falls to zero
+LARGEST_COMMAND = np.array([1.5, 0.8, 1.2])  # forward and left in m/s, turn in rad/s; of training
 EPISODE_STEPS = 1000  # of training
 
 
@@ -66,7 +72,12 @@ class Robot(Protocol):
         """The newest measurement."""
 
     def command(self, targets: np.ndarray, kp: float, kd: float) -> None:
-        """Set the joints' targets (12,) in rad and the gains of their PD loops, which hold until the next command."""
+        """
+        Set the joints' targets (12,) in rad and the gains of their PD loops, which hold until the next command.
+
+        Has to return at once. The watchdog calls it from its own thread, during another call if that one hangs. No code here
+        helps if the process dies: let the robot damp its joints by itself if commands fail to come.
+        """
 
     def wait(self) -> None:
         """Return at the next tick of 50 Hz."""
@@ -123,15 +134,28 @@ class Guard:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.stop("the end")  # if this fails, the watchdog tries again
         self._over.set()
-        self._watchdog.join()
-        self.stop("the end")
+        self._watchdog.join(self.patience)
 
     def stop(self, reason: str) -> None:
         """Let the robot sink down, for good. The first reason stays."""
-        with self._lock:
-            self.reason = self.reason or reason
+        self.reason = self.reason or reason
+        is_free = self._lock.acquire(timeout=PERIOD)  # a command that hangs must not keep this one from the robot
+        try:
             self.robot.command(HOME, 0.0, DAMPING)
+        finally:
+            if is_free:
+                self._lock.release()
+
+    def give_up(self, reason: str) -> NoReturn:
+        """
+        Stop the robot.
+
+        :raises StoppedError: always
+        """
+        self.stop(reason)
+        raise StoppedError(self.reason)
 
     def read(self) -> Measurement:
         """
@@ -140,91 +164,126 @@ class Guard:
         :raises StoppedError: it is beyond them
         """
         measured = self.robot.read()
+        if not all(np.isfinite(part).all() for part in measured):
+            self.give_up("a measurement is not finite")
         beyond = np.maximum(LOW - measured.positions, measured.positions - HIGH).max()
         for is_wrong, reason in (
-            (not all(np.isfinite(part).all() for part in measured), "a measurement is not finite"),
             (measured.age > OLDEST, f"the newest measurement is {measured.age * 1e3:.0f} ms old"),
+            (abs(np.linalg.norm(measured.orientation) - 1.0) > 0.01, "the orientation is no unit quaternion"),
             (-measured.gravity[2] < STEEPEST, "the trunk is tilted by more than 60 degrees"),
             (np.abs(measured.velocities).max() > FASTEST, f"a joint turns faster than {FASTEST:g} rad/s"),
             (beyond > 0.1, f"a joint is {beyond:.2f} rad beyond its limits"),
         ):
             if is_wrong:
-                self.stop(reason)
-                raise StoppedError(reason)
+                self.give_up(reason)
         return measured
 
-    def send(self, targets: np.ndarray, positions: np.ndarray) -> None:
+    def send(self, targets: np.ndarray, measured: Measurement) -> None:
         """
         Command targets within the joints' limits and within what the torque limit allows.
 
         :param targets: (12,) rad
-        :param positions: present ones, (12,) rad
+        :param measured: present positions and velocities
         :raises StoppedError: a target is not finite, or the watchdog was faster
         """
-        if not np.isfinite(targets).all():
-            self.stop("a target is not finite")
-        near = np.clip(targets, positions - TORQUE / KP, positions + TORQUE / KP)
+        if not (np.isfinite(targets).all() and np.isfinite(measured.positions + measured.velocities).all()):
+            self.give_up("a target is not finite")
+        without_torque = measured.positions + KD / KP * measured.velocities
+        near = np.clip(targets, without_torque - TORQUE / KP, without_torque + TORQUE / KP)
         with self._lock:
             if self.reason is not None:
                 raise StoppedError(self.reason)
             self.targets = np.clip(near, LOW, HIGH)
             self.robot.command(self.targets, KP, KD)
             self._fed = time.monotonic()
+        if self.reason is not None:  # the watchdog stopped the robot while this command hung, which came after it
+            self.give_up(self.reason)
 
     def _watch(self) -> None:
         while not self._over.wait(PERIOD):
             if time.monotonic() - self._fed > self.patience:
-                self.stop(f"no command came for more than {self.patience * 1e3:.0f} ms")
-                return
+                with contextlib.suppress(Exception):  # then once more, until the robot takes it
+                    self.stop(f"no command came for more than {self.patience * 1e3:.0f} ms")
+                    return
 
 
 def move(guard: Guard, pose: np.ndarray, seconds: float) -> None:
     """Lead the joints to a pose in even steps, from the targets that carry the robot at present."""
     start = guard.read().positions if guard.targets is None else guard.targets
     for share in np.linspace(0.0, 1.0, round(seconds / PERIOD) + 1)[1:]:
-        guard.send(start + share * (pose - start), guard.read().positions)
+        guard.send(start + share * (pose - start), guard.read())
         guard.robot.wait()
 
 
-def walk(guard: Guard, policy: Policy, command: np.ndarray, n_steps: int) -> list[float]:
+def walk(guard: Guard, policy: Policy, command: np.ndarray, n_steps: int, ended: threading.Event) -> list[float]:
     """
-    Walk by a policy.
+    Walk by a policy. The command grows from zero and falls to zero.
 
     :param command: forward and left in m/s, turn in rad/s, (3,)
+    :param ended: once it is set, the command falls to zero, and the walk ends
     :return: milliseconds of each decision
+    :raises StoppedError: by a limit or the watchdog
     """
     milliseconds: list[float] = []
     target_return = policy.settings["target_return"] or 0.0
-    action = np.zeros(12)
-    for step in range(n_steps):
+    action, step, level, full = np.zeros(12), 0, 0, round(RAMP / PERIOD)
+    while True:
+        if ended.is_set():
+            n_steps = min(n_steps, step + level)
+        if step >= n_steps:
+            return milliseconds
+        level = min(level + 1, full, n_steps - step - 1)
+        asked = level / full * command
         measured = guard.read()
         start = time.perf_counter()
-        parts = (measured.gyro, measured.gravity, measured.positions - HOME, measured.velocities, action, command)
+        parts = (measured.gyro, measured.gravity, measured.positions - HOME, measured.velocities, action, asked)
         # A walk has no end: from the middle of an episode on, time and the return that is left stand still.
         timestep = min(step, EPISODE_STEPS // 2)
         left = target_return * (1 - timestep / EPISODE_STEPS)
-        action = np.clip(policy.act(np.concatenate(parts).astype(np.float32), left, timestep), -1.0, 1.0)
+        action = policy.act(np.concatenate(parts).astype(np.float32), left, timestep)
         milliseconds.append((time.perf_counter() - start) * 1e3)
-        guard.send(HOME + ACTION_SCALE * action, measured.positions)
+        if not np.isfinite(action).all():
+            guard.give_up("the policy's action is not finite")
+        action = np.clip(action, -1.0, 1.0)
+        guard.send(HOME + ACTION_SCALE * action, measured)
         guard.robot.wait()
-    return milliseconds
+        step += 1
+
+
+@contextlib.contextmanager
+def ended_by_keyboard() -> Iterator[threading.Event]:
+    """An event that the first Ctrl-C sets; the second lets the robot sink down."""
+    ended = threading.Event()
+
+    def end(*_: Any) -> None:
+        print("Interrupted; lying down. Once more lets the robot sink down at once.")
+        ended.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    earlier = signal.signal(signal.SIGINT, end)
+    try:
+        yield ended
+    finally:
+        signal.signal(signal.SIGINT, earlier)
 
 
 def run(robot: Robot, policy: Policy, command: np.ndarray, seconds: float, patience: float = PATIENCE) -> list[float]:
     """
-    Stand up, walk, lie down.
+    Stand up, walk, lie down; in the main thread. Ctrl-C ends the walk.
 
+    :param command: forward and left in m/s, turn in rad/s, (3,)
     :return: milliseconds of each decision
+    :raises ValueError: a command beyond `LARGEST_COMMAND`
     :raises StoppedError: by a limit or the watchdog
     """
+    if not (np.abs(command) <= LARGEST_COMMAND).all():
+        raise ValueError(
+            f"command {command.tolist()} is beyond {LARGEST_COMMAND.tolist()}, which training asked for at most."
+        )
     policy.act(np.zeros(45, np.float32), 0.0, 0)  # the first call takes longer than the watchdog waits
-    milliseconds: list[float] = []
-    with Guard(robot, patience) as guard:
+    with ended_by_keyboard() as ended, Guard(robot, patience) as guard:
         move(guard, HOME, STANDING_UP)
-        try:
-            milliseconds = walk(guard, policy, command, round(seconds / PERIOD))
-        except KeyboardInterrupt:
-            print("Interrupted; lying down.")
+        milliseconds = walk(guard, policy, command, round(seconds / PERIOD), ended)
         move(guard, DOWN, STANDING_UP)
     return milliseconds
 
@@ -239,8 +298,11 @@ def main() -> None:
     options = parser.parse_args()
     robot: Any = SimulatedRobot(options.model_file)
     command = np.array([options.forward, options.left, options.turn])
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("Terminated; the robot sinks down."))
     try:
         milliseconds = run(robot, Policy(options.policy), command, options.seconds)
+    except ValueError as error:
+        parser.error(str(error))
     except StoppedError as error:
         raise SystemExit(f"The robot was stopped: {error}.") from error
     if milliseconds:

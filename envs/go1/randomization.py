@@ -21,7 +21,7 @@ class Draw(NamedTuple):
     :param centre: shift of the trunk's centre of mass, (3,) metres
     :param joint_zero: what the joints read where they should read 0, (12,) rad
     :param delay: until a target arrives, as a share of a decision's time
-    :param strength: factors of the motors' torques, (12,)
+    :param strength: factors of the motors' torques, (12,); of our servos, only of the part that Kp makes
     """
 
     friction: np.ndarray
@@ -35,7 +35,7 @@ class Draw(NamedTuple):
     strength: np.ndarray
 
 
-# Range and shape of each, in the order of the draw; Playground's own, but for the motors' strength, which it leaves alone.
+# Range and shape of each, in the order of the draw. Playground's, which leaves delay and the motors' strength alone.
 RANGES: dict[str, tuple[float, float, tuple[int, ...]]] = {
     "friction": (0.4, 1.0, ()),
     "joint_friction": (0.9, 1.1, (12,)),

@@ -25,7 +25,7 @@ class MotorSimulation(Simulation):
 
     :param model_file: MuJoCo XML with the joints and feet of :data:`~sb3_dtfm.envs.go1.model.JOINT_NAMES` and
         :data:`~sb3_dtfm.envs.go1.model.LEGS` in any order, a motor for each joint, and with or without a floor
-    :raises ValueError: a joint turns about another axis
+    :raises ValueError: a joint turns about another axis, or is driven by something else than a motor
     """
 
     is_delay_fixed = True
@@ -38,6 +38,9 @@ class MotorSimulation(Simulation):
         super().__init__(spec.compile())
         self.delay = round(DELAY / TIMESTEP)
         self.kp, self.kd = KP, KD
+        is_motor = (self.model.actuator_biastype == mujoco.mjtBias.mjBIAS_NONE) & (self.model.actuator_gainprm[:, 0] == 1.0)
+        if not (is_motor & (self.model.actuator_gear[:, 0] == 1.0))[self.actuators].all():
+            raise ValueError(f"{model_file}: actuators must be motors that take torques in N m, not servos of positions.")
         axes = np.array([self.model.joint(name).axis for name in JOINT_NAMES])
         if not np.allclose(axes, AXES):
             name = JOINT_NAMES[int(np.flatnonzero(np.abs(axes - AXES).max(axis=1) > 1e-8)[0])]

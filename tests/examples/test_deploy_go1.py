@@ -1,8 +1,10 @@
 """The Go1's deployment: limits, watchdog, start and stop, with a stand-in for the second simulation's file."""
 
 import importlib
+import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -74,6 +76,7 @@ def test_its_numbers_are_those_of_the_task(deploy):
         simulation.DECISION,
         EPISODE_STEPS,
     )
+    np.testing.assert_array_equal(deploy.LARGEST_COMMAND, env.COMMAND_LIMITS)
 
 
 def test_it_says_first_that_hardware_was_never_tried(deploy):
@@ -112,21 +115,67 @@ def test_a_policy_sees_the_observation_of_the_task(deploy, robot, policy_file):
     command = np.array([0.3, 0.0, -0.2])
     with deploy.Guard(robot, 30.0) as guard:
         deploy.move(guard, deploy.HOME, 1.0)
-        deploy.walk(guard, policy, command, 3)
-    assert [timestep for _, (_, _, timestep) in seen] == [0, 1, 2]
-    assert [left for _, (_, left, _) in seen] == pytest.approx([20.0, 19.98, 19.96])
+        deploy.walk(guard, policy, command, 5, threading.Event())
+    assert [timestep for _, (_, _, timestep) in seen] == [0, 1, 2, 3, 4]
+    assert [left for _, (_, left, _) in seen] == pytest.approx([20.0, 19.98, 19.96, 19.94, 19.92])
     for step, (motion, (observation, *_)) in enumerate(seen):
-        np.testing.assert_allclose(observation, observation_of(motion, np.full(12, 0.1 * step), command), atol=1e-6)
+        asked = [0.02, 0.04, 0.04, 0.02, 0.0][step] * command  # grows and falls by a fiftieth a step
+        np.testing.assert_allclose(observation, observation_of(motion, np.full(12, 0.1 * step), asked), atol=1e-6)
+
+
+@pytest.mark.parametrize("is_interrupted", [False, True])
+def test_a_command_grows_and_falls_to_zero_also_if_a_walk_is_interrupted(deploy, robot, policy_file, is_interrupted):
+    policy, seen, ended = deploy.Policy(str(policy_file)), [], threading.Event()
+
+    def act(observation, *_):
+        seen.append(observation[-3])
+        if is_interrupted and len(seen) == 60:
+            ended.set()
+        return np.zeros(12)
+
+    policy.act = act
+    with deploy.Guard(robot, 30.0) as guard:
+        deploy.move(guard, deploy.HOME, 1.0)
+        deploy.walk(guard, policy, np.array([1.0, 0.0, 0.0]), 200, ended)
+    assert len(seen) == (110 if is_interrupted else 200)
+    assert (max(seen), seen[-1]) == (1.0, 0.0)
+    assert np.abs(np.diff([0.0, *seen])).max() == pytest.approx(0.02, abs=1e-6)
+
+
+def test_the_keyboard_ends_a_walk_and_then_the_run(deploy):
+    before = signal.getsignal(signal.SIGINT)
+    with deploy.ended_by_keyboard() as ended:
+        signal.raise_signal(signal.SIGINT)
+        assert ended.is_set()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_command_beyond_that_of_training_is_refused_before_anything_moves(deploy, robot, policy_file):
+    recorded = Recorded(robot)
+    for wrong in ([100.0, 0.0, 0.0], [0.0, np.nan, 0.0]):
+        with pytest.raises(ValueError, match=r"is beyond \[1.5, 0.8, 1.2\]"):
+            deploy.run(recorded, deploy.Policy(str(policy_file)), np.array(wrong), 1.0)
+    assert not recorded.commands
 
 
 def test_targets_stay_within_joint_and_torque_limits(deploy, robot):
-    recorded, positions = Recorded(robot), deploy.HOME
+    recorded, velocities = Recorded(robot), np.linspace(-20.0, 20.0, 12)
+    standing = robot.read()._replace(positions=deploy.HOME, velocities=np.zeros(12))
     with deploy.Guard(recorded, 30.0) as guard:
-        guard.send(deploy.HOME + 10.0, positions)
-        guard.send(np.full(12, -10.0), deploy.LOW + 0.1)
-    high, low = recorded.commands[0][0], recorded.commands[1][0]
-    np.testing.assert_allclose(high, np.minimum(deploy.HIGH, positions + 23.7 / 35.0))
+        guard.send(deploy.HOME + 10.0, standing)
+        guard.send(np.full(12, -10.0), standing._replace(positions=deploy.LOW + 0.1))
+        for direction in (-10.0, 10.0):
+            guard.send(deploy.HOME + direction, standing._replace(velocities=velocities))
+    high, low, *moving = (targets for targets, *_ in recorded.commands[:4])
+    np.testing.assert_allclose(high, np.minimum(deploy.HIGH, deploy.HOME + 23.7 / 35.0))
     np.testing.assert_allclose(low, deploy.LOW)
+    for targets, torque in zip(moving, (-23.7, 23.7), strict=True):
+        torques = 35.0 * (targets - deploy.HOME) - 0.5 * velocities
+        is_free = (targets > deploy.LOW) & (targets < deploy.HIGH)  # of the joint's own limits
+        assert is_free.sum() >= 6
+        np.testing.assert_allclose(torques[is_free], torque)
 
 
 @pytest.mark.parametrize(
@@ -136,6 +185,8 @@ def test_targets_stay_within_joint_and_torque_limits(deploy, robot):
         ({"velocities": np.full(12, 31.0)}, "faster than 30 rad/s"),
         ({"positions": np.full(12, -3.0)}, "rad beyond its limits"),
         ({"gyro": np.array([0.0, np.nan, 0.0])}, "not finite"),
+        ({"positions": np.full(12, np.nan)}, "not finite"),
+        ({"orientation": np.zeros(4)}, "no unit quaternion"),
         ({"age": 0.05}, "50 ms old"),
     ],
 )
@@ -147,23 +198,77 @@ def test_what_is_beyond_a_limit_stops_the_robot(deploy, robot, changes, reason):
     assert all(kp == 0.0 for _, kp, _ in recorded.commands)
 
 
-def test_a_target_that_is_not_finite_is_never_sent(deploy, robot):
-    recorded = Recorded(robot)
-    with pytest.raises(deploy.StoppedError, match="target is not finite"), deploy.Guard(recorded, 30.0) as guard:
-        guard.send(np.full(12, np.nan), deploy.HOME)
+@pytest.mark.parametrize("wrong", ["target", "position", "action", "infinite action"])
+def test_a_target_that_is_not_finite_is_never_sent(deploy, robot, policy_file, wrong):
+    recorded, measured = Recorded(robot), robot.read()
+    policy = deploy.Policy(str(policy_file))
+    policy.act = lambda *_: np.full(12, np.inf if wrong == "infinite action" else np.nan)
+    act = {
+        "target": lambda guard: guard.send(np.full(12, np.nan), measured),
+        "position": lambda guard: guard.send(deploy.HOME, measured._replace(positions=np.full(12, np.nan))),
+    }.get(wrong, lambda guard: deploy.walk(guard, policy, np.zeros(3), 5, threading.Event()))
+    with pytest.raises(deploy.StoppedError, match="is not finite"), deploy.Guard(recorded, 30.0) as guard:
+        act(guard)
+    assert recorded.commands
     assert all(kp == 0.0 and np.isfinite(targets).all() for targets, kp, _ in recorded.commands)
 
 
 def test_the_watchdog_stops_the_robot_while_a_policy_still_thinks(deploy, robot):
     recorded = Recorded(robot)
     with deploy.Guard(recorded, 0.1) as guard:
-        guard.send(deploy.HOME, deploy.HOME)
+        guard.send(deploy.HOME, robot.read())
         time.sleep(0.4)
         during = list(recorded.commands)
         with pytest.raises(deploy.StoppedError, match="no command came for more than 100 ms"):
-            guard.send(deploy.HOME, deploy.HOME)
+            guard.send(deploy.HOME, robot.read())
     assert [kp for _, kp, _ in during] == [deploy.KP, 0.0]
     assert all(kp == 0.0 for _, kp, _ in recorded.commands[1:])
+
+
+def test_the_watchdog_tries_again_until_the_robot_takes_its_command(deploy, robot):
+    recorded, failures = Recorded(robot), [OSError("no connection")] * 3
+
+    def command(targets, kp, kd):
+        if kp == 0.0 and failures:
+            raise failures.pop()
+        recorded.commands.append((targets, kp, kd))
+
+    recorded.command = command
+    with deploy.Guard(recorded, 0.05) as guard:
+        guard.send(deploy.HOME, robot.read())
+        wait_until(lambda: len(recorded.commands) == 2)
+    assert not failures
+    assert recorded.commands[1][1:] == (0.0, deploy.DAMPING)
+
+
+def test_the_watchdog_stops_the_robot_while_a_command_hangs(deploy, robot):
+    recorded, is_released = Recorded(robot), threading.Event()
+
+    def command(targets, kp, kd):
+        if kp > 0.0:
+            is_released.wait(30.0)
+        recorded.commands.append((targets, kp, kd))
+
+    def send(guard):
+        with pytest.raises(deploy.StoppedError, match="no command came"):
+            guard.send(deploy.HOME, robot.read())
+
+    recorded.command = command
+    with deploy.Guard(recorded, 0.05) as guard:
+        hanging = threading.Thread(target=send, args=[guard])
+        hanging.start()
+        wait_until(lambda: len(recorded.commands) == 1)
+        is_released.set()
+        hanging.join()
+    assert recorded.commands[0][1:] == (0.0, deploy.DAMPING)
+    assert [kp for _, kp, _ in recorded.commands[1:]] == [deploy.KP, 0.0, 0.0]  # the late one is taken back
+
+
+def wait_until(condition, seconds=30.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
 
 
 def test_it_runs_as_a_command_and_names_its_milliseconds(deploy, policy_file, tmp_path):

@@ -115,6 +115,7 @@ def test_commands_are_drawn_within_their_limits_and_anew(env):
             if env._n_steps * 0.02 >= env._next_command:
                 env._draw_command()
     drawn = np.array(commands)
+    np.testing.assert_array_equal(COMMAND_LIMITS, [1.5, 0.8, 1.2])
     assert (np.abs(drawn) <= COMMAND_LIMITS).all()
     assert (np.abs(drawn).max(axis=0) > 0.9 * COMMAND_LIMITS).all()
     np.testing.assert_allclose(np.mean(drawn != 0.0, axis=0), [0.9, 0.25, 0.5], atol=0.15)
@@ -137,6 +138,17 @@ def test_starts_are_drawn_within_their_ranges(env):
 def test_robots_are_drawn_from_all_of_each_range():
     rng = np.random.default_rng(0)
     draws = [draw_robot(rng) for _ in range(500)]
+    assert RANGES == {
+        "friction": (0.4, 1.0, ()),
+        "joint_friction": (0.9, 1.1, (12,)),
+        "armature": (1.0, 1.05, (12,)),
+        "mass": (0.9, 1.1, (13,)),
+        "payload": (-1.0, 1.0, ()),
+        "centre": (-0.05, 0.05, (3,)),
+        "joint_zero": (-0.05, 0.05, (12,)),
+        "delay": (0.0, 1.0, ()),
+        "strength": (0.9, 1.1, (12,)),
+    }
     for name, (low, high, shape) in RANGES.items():
         values = np.array([getattr(draw, name) for draw in draws])
         assert values.shape == (500, *shape)
@@ -182,6 +194,8 @@ def test_noise_lies_within_its_ranges(env):
     env.reset(seed=0)
     motion, rng = env.simulation.motion, np.random.default_rng(0)
     measured = [add_noise(motion, rng) for _ in range(300)]
+    published = {"velocity": 0.1, "gyro": 0.2, "gravity": 0.05, "joint_positions": 0.03, "joint_velocities": 1.5}
+    assert published == NOISE
     for name, most in NOISE.items():
         deviations = np.abs([getattr(each, name) - getattr(motion, name) for each in measured])
         assert 0.95 * most < deviations.max() <= most
@@ -232,7 +246,7 @@ def test_a_late_target_leaves_the_last_one_in_force():
 
 RENDER = """
 import gymnasium, sb3_dtfm.envs
-env = gymnasium.make("Go1Velocity-v0", render_mode="rgb_array", width=64, height=48)
+env = gymnasium.make("Go1Velocity-v0", render_mode="rgb_array", width=800, height=600)
 env.reset(seed=0)
 image = env.render()
 env.close()
@@ -243,7 +257,7 @@ print(image.shape, image.dtype, image.std() > 10)
 @pytest.mark.skipif(ctypes.util.find_library("OSMesa") is None, reason="needs OSMesa")
 def test_renders_without_display():
     result = run_python(RENDER, MUJOCO_GL="osmesa")
-    assert result.stdout == "(48, 64, 3) uint8 True\n", result.stderr
+    assert result.stdout == "(600, 800, 3) uint8 True\n", result.stderr
 
 
 @pytest.mark.parametrize("action", [np.zeros(11), np.full(12, np.nan), np.zeros((1, 12))])

@@ -37,6 +37,24 @@ def test_joints_are_those_of_the_robot_in_its_order(model):
     assert [model.actuator(number).name + "_joint" for number in range(12)] == list(JOINT_NAMES)
 
 
+def test_geometry_and_joints_are_the_published_ones(model):
+    for leg, x, y in (("FL", 1, 1), ("FR", 1, -1), ("RL", -1, 1), ("RR", -1, -1)):
+        for link, position, centre in (
+            ("hip", (0.1881 * x, 0.04675 * y, 0.0), (-0.0049166 * x, -0.00762615 * y, -8.865e-05)),
+            ("thigh", (0.0, 0.08 * y, 0.0), (-0.00304722, -0.019315 * y, -0.0305004)),
+            ("calf", (0.0, 0.0, -0.213), (0.00429862, 0.000976676, -0.146197)),
+        ):
+            np.testing.assert_allclose(model.body(f"{leg}_{link}").pos, position)
+            np.testing.assert_allclose(model.body(f"{leg}_{link}").ipos, centre)
+        np.testing.assert_allclose(model.geom(leg).pos, (0.0, 0.0, -0.213))
+        assert model.geom(leg).size[0] == 0.023
+    np.testing.assert_allclose(model.body("trunk").ipos, (0.0223, 0.002, -0.0005))
+    np.testing.assert_allclose(model.dof_frictionloss[6:], [0.3, 0.3, 1.0] * 4)
+    np.testing.assert_allclose(model.dof_damping[6:], 0.5)
+    np.testing.assert_allclose(model.dof_armature[6:], 0.005)
+    assert model.opt.timestep == 0.004
+
+
 def test_inertia_is_the_published_one_about_its_principal_axes(model):
     """The published diagonal is of axes that are turned; traces and determinants are of none."""
     for body, published in {

