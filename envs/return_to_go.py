@@ -4,7 +4,7 @@ import math
 import re
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple, SupportsFloat
 
 import gymnasium as gym
@@ -33,6 +33,13 @@ TIMESTEP = "timestep"
 IMAGE = "image"
 # Numbers of channels that images have.
 CHANNELS = (1, 3, 4)
+# Sides of a matrix that may be a picture, pixels.
+SMALLEST_PICTURE = 16
+# Names of a step's arrays and of an exported file's inputs, which no image may have.
+RESERVED = {
+    *(OBSERVATION, RETURN_TO_GO, TIMESTEP, "observations", "actions", "rewards", "returns_to_go"),
+    *("timesteps", "mask", "noise", "features", "keys_values", "episode_keys"),
+}
 # Wrappers whose order decides whether an evaluation sees an episode's end.
 WRAPPERS = ("TimeLimit", "Monitor", "ReturnToGoWrapper")
 # In `info` after several actions: what was observed between them.
@@ -66,6 +73,29 @@ def check_image_shape(shape: tuple[int, ...], name: str) -> None:
     """
     if (shape[0] in CHANNELS) == (shape[2] in CHANNELS):
         raise ValueError(f"{name} has shape {shape}, expected 1, 3 or 4 channels, either first or last.")
+
+
+def looks_like_images(shape: tuple[int, ...]) -> bool:
+    """
+    Return whether numbers other than bytes have the shape of an image, or of several.
+
+    :param shape: of a step
+    """
+    return len(shape) > 3 or (len(shape) == 3 and bool({shape[0], shape[2]} & set(CHANNELS)))
+
+
+def warn_if_a_picture(shape: tuple[int, ...]) -> None:
+    """
+    Say that a matrix as large as a picture becomes a vector.
+
+    :param shape: of a step
+    """
+    if len(shape) == 2 and min(shape) >= SMALLEST_PICTURE:
+        warnings.warn(
+            f"A part of the observation has the shape {shape} and becomes a vector of {math.prod(shape)} numbers. If it is "
+            "an image, give it as uint8 of (height, width, 1).",
+            stacklevel=3,
+        )
 
 
 def channels_first(space: spaces.Box) -> spaces.Box:
@@ -103,7 +133,7 @@ def sort_observation_space(space: spaces.Space) -> spaces.Space:
             f"Observation space {space} is no image that can be used: height, width and channels of uint8 are expected, "
             "as a space of its own or as an entry of the Dict that the environment observes."
         )
-    if isinstance(space, spaces.Box) and len(space.shape) == 3 and {space.shape[0], space.shape[2]} & set(CHANNELS):
+    if isinstance(space, spaces.Box) and looks_like_images(space.shape):
         raise ValueError(
             f"Observation space {space} looks like an image of {space.dtype}; images are uint8, 0 to 255. Scale them in a "
             "wrapper, or flatten what is none: gymnasium.wrappers.FlattenObservation."
@@ -130,6 +160,26 @@ def flatten_observation_space(space: spaces.Space) -> spaces.Box:
         return spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
 
 
+def check_cameras(images: Iterable[str]) -> None:
+    """
+    Refuse images whose names stand for something else.
+
+    :param images: their names
+    :raises ValueError: a name of what ReturnToGoWrapper shows, of a step's arrays, or of an exported file's inputs
+    """
+    if taken := sorted(RESERVED.intersection(images)):
+        raise ValueError(f"An image is called {', '.join(taken)}, which is the name of something else here; rename it.")
+
+
+def _boxes(space: spaces.Space) -> Iterator[spaces.Box]:
+    """All Box parts of a space."""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        for part in space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces:
+            yield from _boxes(part)
+    elif isinstance(space, spaces.Box):
+        yield space
+
+
 def return_to_go_space(observation_space: spaces.Space, images: Mapping[str, spaces.Box] | None = None) -> spaces.Dict:
     """
     Observation space of a sequence policy, for an environment or for a dataset.
@@ -140,8 +190,9 @@ def return_to_go_space(observation_space: spaces.Space, images: Mapping[str, spa
     :raises ValueError: `observation_space` cannot be flattened, or an image cannot be used
     """
     images = image_spaces(observation_space) if images is None else images
-    if taken := {OBSERVATION, RETURN_TO_GO, TIMESTEP} & images.keys():
-        raise ValueError(f"An image is called {', '.join(taken)}, as what ReturnToGoWrapper shows; give it another name.")
+    for part in _boxes(without_images(observation_space)):
+        warn_if_a_picture(part.shape)
+    check_cameras(images)
     for camera, space in images.items():
         check_image_shape(space.shape, f"The image {camera!r}")
         if not is_image_space(space, check_channels=False):

@@ -48,7 +48,12 @@ class Policy:
         """
         for camera, shape in self.settings["images"].items():
             image = (images or {})[camera]
-            self.inputs[camera][0] = image if list(image.shape) == shape else np.moveaxis(image, -1, 0)
+            image = image if list(image.shape) == shape else np.moveaxis(image, -1, 0)
+            if image.dtype != np.uint8 or list(image.shape) != shape:
+                raise ValueError(
+                    f"{camera}: expected uint8 of {shape}, channels first or last; got {image.dtype}, {image.shape}"
+                )
+            self.inputs[camera][0] = image
         if timestep == 0:
             self.inputs["mask"][:], self.plan = False, []
             if "episode_keys" in self.inputs:

@@ -222,6 +222,14 @@ class _Table(Arrays):
         super().__init__(source, [str(name) for name in names], n_stored)
         self._columns = {str(name): table[name] for name in names}
 
+    def describe(self, name: str) -> tuple[tuple[int, ...], np.dtype] | None:
+        column = self._columns[name]
+        first = next(iter(column), None)
+        with contextlib.suppress(ValueError):  # lists of different lengths
+            array = np.asarray(first)
+            return ((len(column), *array.shape), array.dtype) if array.dtype != object else None
+        return None
+
     def _get(self, name: str, where: str) -> Any:
         column = self._columns[name]
         array = np.asarray(column.to_numpy() if hasattr(column, "to_numpy") else column)
@@ -241,6 +249,13 @@ class _Parquet(Arrays):
         n_numbers = sum(group.column(i).num_values for group in groups for i in range(group.num_columns))
         check_size(8 * n_numbers, self.n_stored or 0, f"{source}: {file.metadata.num_rows} rows")
         self._file = file
+
+    def describe(self, name: str) -> tuple[tuple[int, ...], np.dtype] | None:
+        with contextlib.suppress(DatasetError):  # no rows, lists of different lengths, or no numbers
+            for row in self._file.iter_batches(batch_size=1, columns=[name]):
+                found = as_numbers(row.column(0), name)
+                return (self._file.metadata.num_rows, *found.shape[1:]), found.dtype
+        return None
 
     def _get(self, name: str, where: str) -> Any:
         table = self._file.read(columns=[name])

@@ -31,7 +31,7 @@ def as_numbers(values: Any, where: str) -> np.ndarray:
 
     :param values: a pyarrow Array whose entries are numbers, or lists of as many, which may hold further lists
     :param where: the file and the column, for messages
-    :return: (N, .), all axes of a row as one
+    :return: (N, ...), an axis for each level of lists
     :raises DatasetError: no rows, lists of several lengths, or no numbers
     """
     n_rows = len(values)
@@ -40,11 +40,13 @@ def as_numbers(values: Any, where: str) -> np.ndarray:
     pyarrow = import_pyarrow(where)
     if isinstance(values, pyarrow.ExtensionArray):
         values = values.storage
+    axes = []
     while hasattr(values, "flatten") and hasattr(values.type, "value_type"):  # a list of any kind
         sizes = np.unique(pyarrow.compute.list_value_length(values).fill_null(0))
         if len(sizes) > 1:
             raise DatasetError(f"{where} holds lists of {sizes[0]} to {sizes[-1]} entries; one length is expected.")
+        axes.append(int(sizes[0]))
         values = values.flatten()
     array = values.to_numpy(zero_copy_only=False)
     check_real(array.dtype, where)
-    return array.reshape(n_rows, -1)
+    return array.reshape(n_rows, *axes)

@@ -58,7 +58,7 @@ def decide(buffer: TrajectoryBuffer) -> list[Decision]:
     if all(each.value for each in by_return):
         decisions += _by_reward(buffer)
     if isinstance(buffer.action_space, spaces.Box):
-        decisions += _kind_of_actor(errors, correlation_of_changes(buffer))
+        decisions += _kind_of_actor(errors, correlation_of_changes(buffer), _seen(buffer))
     return decisions
 
 
@@ -115,7 +115,7 @@ def _dropout(buffer: TrajectoryBuffer) -> Decision:
     per_dimension = len(buffer) / int(buffer.observation_space.shape[0])
     few = per_dimension < FEW_STEPS_PER_DIMENSION
     number = f"{'fewer' if few else 'not fewer'} than {FEW_STEPS_PER_DIMENSION}"
-    reason = f"There are {per_dimension:,.0f} recorded steps for each dimension of the observation, {number}."
+    reason = f"There are {per_dimension:,.0f} recorded steps for each dimension of {_seen(buffer)}, {number}."
     return Decision("dropout", DROPOUT if few else 0.0, reason)
 
 
@@ -156,7 +156,12 @@ def _by_reward(buffer: TrajectoryBuffer) -> list[Decision]:
     ]
 
 
-def _kind_of_actor(errors: PredictionErrors | None, correlation: float) -> list[Decision]:
+def _seen(buffer: TrajectoryBuffer) -> str:
+    """What predictions are made of."""
+    return "the vector beside the images" if buffer.image_spaces else "the observation"
+
+
+def _kind_of_actor(errors: PredictionErrors | None, correlation: float, seen: str) -> list[Decision]:
     """Settings that depend on whether previous action or observation predicts actions better."""
     ratio = None if errors is None else errors.plan_ratio()
     plans = ratio is not None and ratio > 1.0
@@ -164,10 +169,10 @@ def _kind_of_actor(errors: PredictionErrors | None, correlation: float) -> list[
     flow = {"flow_steps": FLOW_STEPS if plans else 0, "regression_coef": 0.0 if plans else 1.0}
     # Scripts depend on the time step: it raised success on Lift from 34 to 46 %, ten demonstrations and batches of 256.
     settings = {"chunk_size": CHUNK_SIZE if plans else 1, **flow, "timestep_embedding": plans}
-    better, worse = ("The previous action", "the observation") if plans else ("The observation", "the previous action")
-    reason = f"{better} predicts actions better than {worse} does (ratio of squared errors {ratio or 0.0:.3g})."
+    better, worse = ("the previous action", seen) if plans else (seen, "the previous action")
+    reason = f"T{better[1:]} predicts actions better than {worse} does (ratio of squared errors {ratio or 0.0:.3g})."
     if ratio is None:
-        reason = "There are too few episodes to compare how observation and previous action predict actions."
+        reason = f"There are too few episodes to compare how {seen} and the previous action predict actions."
     # Ten scripted demonstrations of Lift: 76 % success with "std", 43 % with "robust"; human Adroit door: 6 and 49 %.
     robust = not plans or correlation < NOISY
     noise = f"Successive changes of an action correlate by {correlation:.2f} (noise does by less than {NOISY})."

@@ -17,6 +17,7 @@ from sb3_dtfm.data.flat import bounded_space, fitted, json_options, warn_of_made
 from sb3_dtfm.data.lerobot_images import DATA, EPISODE, FRAME, IMAGE, INFO, TIME, VIDEO, Cameras, Columns
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_flags, wrap_dataset_errors
+from sb3_dtfm.envs.return_to_go import SMALLEST_PICTURE
 from sb3_dtfm.files import warn
 
 ACTION, REWARDS, SUCCESS, DONE = "action", ("next.reward", "reward"), "next.success", "next.done"
@@ -86,7 +87,7 @@ def load_lerobot(
     source = str(folder)
     info = _info(folder, source)
     features = {name: each["dtype"] for name, each in info["features"].items()}
-    maps = {name for name, each in info["features"].items() if WHOLE.match(each["dtype"]) and len(each.get("shape", ())) > 1}
+    maps = {name for name, each in info["features"].items() if _is_map(each["dtype"], each.get("shape", []))}
     names = _names(observation_keys, features, maps, source)
     cameras = {name: key for name, key in names.items() if features[key] in (IMAGE, VIDEO)}
     vectors = [key for name, key in names.items() if name not in cameras]
@@ -162,8 +163,9 @@ def _info(folder: Path, source: str) -> dict[str, Any]:
         for name, each in info["features"].items():
             if not isinstance(each["dtype"], str):
                 raise DatasetError(f"{source}: {INFO}: dtype of {name} is {each['dtype']!r:.20}; a word is expected.")
-            if not isinstance(each.get("shape", []), list):
-                raise DatasetError(f"{source}: {INFO}: shape of {name} is {each['shape']!r:.20}; a list is expected.")
+            shape = each.get("shape", [])
+            if not isinstance(shape, list) or (each["dtype"] in NUMBERS and not all(map(COUNT.accepts, shape))):
+                raise DatasetError(f"{source}: {INFO}: shape of {name} is {shape!r:.20}; whole numbers are expected.")
         return info
 
 
@@ -191,6 +193,15 @@ def _names(
             f"{source}: no feature of numbers or images begins with {OBSERVATION!r}, only {', '.join(known)}."
         )
     return names
+
+
+def _is_map(dtype: str, shape: list[int]) -> bool:
+    """Return whether a feature of numbers has a picture's shape, such as a map of depth."""
+    return (
+        dtype in NUMBERS
+        and len(shape) > 1
+        and (WHOLE.match(dtype) is not None or len(shape) > 2 or min(shape) >= SMALLEST_PICTURE)
+    )
 
 
 def _size(size: Any) -> tuple[int, int]:

@@ -63,7 +63,8 @@ class Columns:
                 check_size(8 * n_numbers, self.n_stored, f"{source}: {sum(n for _, n in self.files)} frames")
                 table = file.read(columns=names)
                 table.validate(full=True)
-                parts.append({name: as_numbers(table[name].combine_chunks(), f"{path}: {name}") for name in names})
+                found = {name: as_numbers(table[name].combine_chunks(), f"{path}: {name}") for name in names}
+                parts.append({name: values.reshape(len(values), -1) for name, values in found.items()})
         with wrap_dataset_errors(source):
             self.numbers = {name: np.concatenate([each[name] for each in parts]) for name in names}
 

@@ -13,7 +13,9 @@ from sb3_dtfm.envs.return_to_go import (
     IMAGE,
     flatten_observation_space,
     image_spaces,
+    looks_like_images,
     sort_observation_space,
+    warn_if_a_picture,
     without_images,
 )
 
@@ -251,14 +253,20 @@ def check_no_images(array: np.ndarray, where: str) -> None:
 
     :param array: (T, ...)
     :param where: whose it is, for messages
-    :raises DatasetError: bytes with more than one axis a step
+    :raises DatasetError: bytes with more than one axis a step, or other numbers in the shape of images
     """
-    bytes_of_images = array.dtype == np.uint8 and array.ndim > 2
-    if bytes_of_images or (array.ndim == 4 and {array.shape[1], array.shape[3]} & {1, 3, 4}):
+    if array.dtype == np.uint8 and array.ndim == 4:
+        raise DatasetError(
+            f"{where} holds images of shape {array.shape[1:]} inside of another entry; move them to an entry of the "
+            "observation itself."
+        )
+    if (array.dtype == np.uint8 and array.ndim > 2) or looks_like_images(array.shape[1:]):
         raise DatasetError(
             f"{where} is {array.dtype} of shape {array.shape}, expected images as uint8 of (steps, height, width, "
-            "channels), 0 to 255, or vectors of numbers; for floats from 0 to 1 write (255 * images).astype(np.uint8)."
+            "channels), 0 to 255, or vectors of numbers; for floats from 0 to 1 write (255 * images).astype(np.uint8), and "
+            "flatten what is no image."
         )
+    warn_if_a_picture(array.shape[1:])
 
 
 def flatten_observations(read: ReadArray, path: tuple[str | int, ...], space: spaces.Space, where: str) -> list[np.ndarray]:

@@ -92,7 +92,8 @@ def arrays_of_steps(steps: Sequence[Any], where: str) -> dict[str, Any]:
         missing = next((number for number, row in enumerate(rows) if name not in row), None)
         if missing is not None:
             raise DatasetError(f"{where}: step {missing} has no {name!r}, which step 0 has.")
-        arrays[name] = _stacked([row[name] for row in rows]) if name in OBSERVATIONS else [row[name] for row in rows]
+        parts = [row[name] for row in rows]
+        arrays[name] = _stacked(parts, f"{where}: {name}") if name in OBSERVATIONS else parts
     infos = next((arrays.pop(name) for name in INFO if name in arrays), None)
     if infos is not None and all(isinstance(info, Mapping) for info in infos):
         reported = [reported_success(info) for info in infos]
@@ -136,12 +137,18 @@ def _next_observation(parts: Sequence[Any]) -> int | None:
     return None if two_flags else 3
 
 
-def _stacked(observations: Sequence[Any]) -> Any:
+def _stacked(observations: Sequence[Any], where: str) -> Any:
     """One observation after the other as (T, ...), dictionaries as a dictionary of such, tuples by the places of parts."""
     first = observations[0]
     if isinstance(first, Mapping):
-        return {key: _stacked([observation[key] for observation in observations]) for key in first}
+        return {key: _stacked([observation[key] for observation in observations], f"{where}, {key}") for key in first}
     if isinstance(first, tuple) and any(isinstance(part, Mapping | tuple) or np.ndim(part) for part in first):
         parts = zip(*observations, strict=True)
-        return {place: _stacked(part) for place, part in enumerate(parts)}
-    return np.stack([np.asarray(observation) for observation in observations])
+        return {place: _stacked(part, f"{where}, {place}") for place, part in enumerate(parts)}
+    arrays = [np.asarray(observation) for observation in observations]
+    other = next((number for number, array in enumerate(arrays) if array.shape != arrays[0].shape), None)
+    if other is not None:
+        raise DatasetError(
+            f"{where}: step {other} has the shape {arrays[other].shape}, expected {arrays[0].shape} as in step 0."
+        )
+    return np.stack(arrays)

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_dtfm.actions import ActionSpace
-from sb3_dtfm.envs.return_to_go import check_image_shape
+from sb3_dtfm.envs.return_to_go import check_cameras, check_image_shape
 from sb3_dtfm.files import printable
 
 # Recorded float64 actions may pass a float32 bound by a rounding error; beyond this share of the range they are wrong.
@@ -312,6 +312,7 @@ def check_images(
         if len(array) != n_steps:
             raise DatasetError(f"{where}: has {len(array)} images of {camera!r}, expected {n_steps}, one for each action.")
         try:
+            check_cameras([camera])
             check_image_shape(array.shape[1:], f"an image of {camera!r}")
         except ValueError as error:
             raise DatasetError(f"{where}: {error}") from error

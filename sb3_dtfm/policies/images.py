@@ -8,7 +8,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN
 from torch import nn
 from torch.nn import functional as F
 
@@ -26,7 +26,7 @@ class ResidualExtractor(BaseFeaturesExtractor):
     random crops, as in robomimic (Mandlekar et al., 2021) and Diffusion Policy (Chi et al., 2023). Acting crops the centre.
 
     The first convolution strides by 4, as NatureCNN's, since a stride of 2 learned less in the same seconds on a CPU (one
-    run each, docs/studies/images.md).
+    run each).
 
     :param observation_space: Box (channels, height, width)
     :param features_dim: numbers that an image becomes
@@ -34,7 +34,7 @@ class ResidualExtractor(BaseFeaturesExtractor):
     :param crop: kept share of height and width, in (0, 1]
     :param shift: pixels by which the edges are repeated before a random crop; 4 with `crop=1.0` is the random shift of DrQ
         (Kostrikov et al., 2021)
-    :raises ValueError: another `crop`, a negative `shift`, or fewer than two channels
+    :raises ValueError: another `crop`, a negative `shift`, fewer than two channels, or images too small for their number
     """
 
     def __init__(
@@ -53,6 +53,13 @@ class ResidualExtractor(BaseFeaturesExtractor):
         self.shift = shift
         n_channels, height, width = observation_space.shape
         self.size = (round(crop * height), round(crop * width))
+        # What the stem and the blocks but the last leave of each side.
+        left = [-(-((side - 4) // 4 + 1) // 2 ** (len(channels) - 2)) for side in self.size]
+        if min(left) < 2:
+            raise ValueError(
+                f"of images of {height} x {width} a map of {max(0, left[0])} x {max(0, left[1])} is left, in which no place "
+                "differs; larger images or fewer channels are expected."
+            )
         self.stem = nn.Conv2d(n_channels, channels[0], kernel_size=8, stride=4, padding=2)
         *pairs, last = itertools.pairwise(channels)
         blocks = [ResidualBlock(*pair, stride=2) for pair in pairs]
@@ -94,9 +101,10 @@ class ResidualBlock(nn.Module):
     def __init__(self, n_in: int, n_out: int, stride: int) -> None:
         super().__init__()
         self.first = nn.Conv2d(n_in, n_out, kernel_size=3, stride=stride, padding=1, bias=False)
-        self.first_norm = nn.GroupNorm(n_out // GROUP, n_out)
+        n_groups = max(1, n_out // GROUP)
+        self.first_norm = nn.GroupNorm(n_groups, n_out)
         self.second = nn.Conv2d(n_out, n_out, kernel_size=3, padding=1, bias=False)
-        self.second_norm = nn.GroupNorm(n_out // GROUP, n_out)
+        self.second_norm = nn.GroupNorm(n_groups, n_out)
         same = n_in == n_out and stride == 1
         self.shortcut = nn.Identity() if same else nn.Conv2d(n_in, n_out, kernel_size=1, stride=stride, bias=False)
 
@@ -130,13 +138,18 @@ def extractor_name(given: Any) -> Any:
     The name of an extractor, which a file can hold; a class of a user's own is entered in `EXTRACTORS`.
 
     :param given: a class, or its name
-    :raises ValueError: no extractor of SB3's kind, or one with the name of a packaged one
+    :raises ValueError: no extractor of SB3's kind, one of several spaces, or one with the name of a packaged one
     """
     if not isinstance(given, type):
         return given
     name = given.__name__
     if not issubclass(given, BaseFeaturesExtractor):
         raise ValueError(f"features_extractor_class: {name} is no subclass of SB3's BaseFeaturesExtractor.")
+    if issubclass(given, CombinedExtractor):
+        raise ValueError(
+            f"features_extractor_class: {name} takes a Dict; expected is a class that takes one camera's image, a Box of "
+            "(channels, height, width), such as NatureCNN. Each camera gets one, and vectors none."
+        )
     if PACKAGED.get(name, given) is not given:
         raise ValueError(f"features_extractor_class: {name} is the name of a packaged class; call yours something else.")
     EXTRACTORS[name] = given
@@ -150,9 +163,10 @@ class ImageEncoder(nn.Module):
     :param image_spaces: Box (channels, height, width) uint8 by camera
     :param extractor: a key of `EXTRACTORS`
     :param extractor_kwargs: of that class
-    :param normalize_images: divide by 255, as SB3 does
+    :param normalize_images: divide by 255, as SB3 does; otherwise the extractors get numbers from 0 to 255
     :param shared: one extractor for all cameras, whose images have the same shape
     :ivar features_dim: F
+    :raises ValueError: an extractor that cannot take the images
     """
 
     def __init__(
@@ -171,7 +185,9 @@ class ImageEncoder(nn.Module):
             found = f"got {sorted(shapes)}; resize them or leave it out"
             raise ValueError(f"share_features_extractor=True needs images of one shape, {found}.")
         made = self.cameras[:1] if shared else self.cameras
-        self.extractors = nn.ModuleList(EXTRACTORS[extractor](image_spaces[each], **extractor_kwargs) for each in made)
+        if extractor == ResNet18.__name__ and not normalize_images:
+            raise ValueError("ResNet18 expects images from 0 to 1: leave normalize_images=True.")
+        self.extractors = nn.ModuleList(_made(extractor, extractor_kwargs, each, image_spaces[each]) for each in made)
         self.norms = nn.ModuleList(nn.LayerNorm(self._extractor(i).features_dim) for i in range(len(self.cameras)))
         self.features_dim = sum(self._extractor(i).features_dim for i in range(len(self.cameras)))
 
@@ -190,6 +206,17 @@ class ImageEncoder(nn.Module):
             found = norm(self._extractor(number)(pixels))
             features.append(found.unflatten(0, images[camera].shape[:-3]))
         return th.cat(features, dim=-1)
+
+
+def _made(extractor: str, kwargs: Mapping[str, Any], camera: str, space: spaces.Box) -> BaseFeaturesExtractor:
+    try:
+        return EXTRACTORS[extractor](space, **kwargs)
+    except (ArithmeticError, AssertionError, RuntimeError, TypeError, ValueError) as error:
+        arguments = ", ".join(f"{name}={value!r}" for name, value in kwargs.items())
+        raise ValueError(
+            f"features_extractor_class {extractor}({arguments}) cannot be made for the camera {camera!r}, whose images have "
+            f"the shape {space.shape} (channels, height, width): {error}"
+        ) from error
 
 
 def image_spaces(observation_space: spaces.Dict) -> dict[str, spaces.Box]:
@@ -225,5 +252,5 @@ def unpack_images(observation: Mapping[str, Any], expected: Mapping[str, spaces.
                 f"observation[{camera!r}] is {image.dtype} of shape {image.shape}; uint8 of "
                 f"({n_rows}, {channels}, {height}, {width}) or ({n_rows}, {height}, {width}, {channels}) is expected."
             )
-        images[camera] = image
+        images[camera] = np.ascontiguousarray(image)  # PyTorch takes no reversed axes
     return images

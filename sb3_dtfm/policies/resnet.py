@@ -11,6 +11,8 @@ from torch import nn
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 # Channels in each group of a group normalisation.
 GROUP = 16
+# Buffers of batch normalisation.
+STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
 
 
 class ResNet18(BaseFeaturesExtractor):
@@ -41,12 +43,23 @@ class ResNet18(BaseFeaturesExtractor):
             raise ValueError(f"ResNet18 needs images of 3 channels, got {observation_space.shape[0]}.")
         self.network = resnet18(norm_layer=lambda n_channels: nn.GroupNorm(n_channels // GROUP, n_channels))
         if weights is not None:
-            found = self.network.load_state_dict(th.load(weights, weights_only=True), strict=False)
-            if found.missing_keys:
-                raise ValueError(f"{weights} holds no weights of ResNet-18: {found.missing_keys[0]} is missing.")
+            self._load(weights)
         self.network.fc = nn.Linear(self.network.fc.in_features, features_dim)
         self.register_buffer("mean", th.tensor(MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", th.tensor(STD).view(3, 1, 1), persistent=False)
+
+    def _load(self, weights: str | PathLike[str]) -> None:
+        """Take all but the last layer, which is replaced, and the statistics of batch normalisation, which is not used."""
+        stored = {name: each for name, each in th.load(weights, weights_only=True).items() if not name.startswith("fc.")}
+        try:
+            found = self.network.load_state_dict(stored, strict=False)
+        except RuntimeError as error:
+            raise ValueError(f"{weights} holds no weights of ResNet-18: {error}") from error
+        missing = [name for name in found.missing_keys if not name.startswith("fc.")]
+        unknown = [name for name in found.unexpected_keys if name.rpartition(".")[2] not in STATISTICS]
+        if missing or unknown:
+            fault = f"{missing[0]} is missing" if missing else f"{unknown[0]} belongs to another network"
+            raise ValueError(f"{weights} holds no weights of ResNet-18: {fault}.")
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Map (N, 3, height, width) to (N, features_dim)."""

@@ -3,8 +3,8 @@ Recordings whose actions are the teacher's, wherever another policy leads: a stu
 (DAgger, Ross et al., 2011), or the teacher with noise (DART, Laskey et al., 2017), and the teacher tells what it would do.
 
     PYTHONPATH=studies python -m go1.labelled go1/labelled-v0 --onnx go1_policy.onnx --noise 0.1 --episodes 100
-    PYTHONPATH=studies python -m go1.labelled go1/student4-v0 --onnx go1_policy.onnx --student 'logs/go1/dtfm-round 3 drag-20-0.zip' \\
-        --episodes 150 --seed 34 --drag --damping
+    PYTHONPATH=studies python -m go1.labelled go1/student4-v0 --onnx go1_policy.onnx \\
+        --student 'logs/go1/dtfm-round 3 drag-20-0.zip' --episodes 150 --seed 34 --drag --damping
 
 The observations hold the actions that were carried out, the dataset those of the teacher. So a model that learns from it has
 to act without the past actions of its window: `go1.contexts run ... --hide-actions window`.

@@ -3,6 +3,7 @@
 import io
 import json
 import shutil
+import sys
 
 import numpy as np
 import pyarrow as pa
@@ -93,9 +94,59 @@ def test_a_step_sees_the_frame_of_its_time(version, kind, tmp_path):
     assert some.observations.tolist() == [[0.0]] * 4
     without = load_dataset(tmp_path / "arm", observation_keys=[STATE])
     assert without.image_spaces == {}
-    small = load_dataset(tmp_path / "arm", image_size=(12, 16))
-    np.testing.assert_array_equal(small.own(CAMERA)[5], resize_image(found[5], (12, 16)))
-    assert DT("MultiInputPolicy", dataset=small, device="cpu").policy.image_spaces[CAMERA].shape == (3, 12, 16)
+    small = load_dataset(tmp_path / "arm", image_size=(24, 32))
+    np.testing.assert_array_equal(small.own(CAMERA)[5], resize_image(found[5], (24, 32)))
+    assert DT("MultiInputPolicy", dataset=small, device="cpu").policy.image_spaces[CAMERA].shape == (3, 24, 32)
+
+
+def test_two_cameras_whose_videos_lie_in_several_files(tmp_path):
+    """In format 3.0 an episode names the file of each of its videos."""
+    folder, other = tmp_path / "arm", "observation.images.hand"
+    images = write(folder, "v3.0")
+    told = json.loads((folder / "meta" / "info.json").read_text())
+    told["features"][other] = told["features"][CAMERA]
+    (folder / "meta" / "info.json").write_text(json.dumps(told))
+    path = folder / "meta" / "episodes" / "file-000.parquet"
+    episodes = pq.read_table(path).to_pydict()
+    for number, (start, stop) in enumerate([(0, 3), (3, 13)]):  # the second file holds two episodes
+        write_video(folder / "videos" / f"{other}/chunk-00{number}/file-00{1 - number}.mp4", list(255 - images[start:stop]))
+    episodes |= {
+        f"videos/{other}/chunk_index": [0, 1, 1],
+        f"videos/{other}/file_index": [1, 0, 0],
+        f"videos/{other}/from_timestamp": [0.0, 0.0, LENGTHS[1] / FPS],
+    }
+    pq.write_table(pa.table(episodes), path)
+    buffer = load_dataset(folder)
+    assert set(buffer.image_spaces) == {CAMERA, other}
+    for camera, expected in ((CAMERA, images), (other, 255 - images)):
+        assert np.abs(buffer.own(camera).numpy().astype(int) - expected).mean() < 4.0
+
+
+def test_pyav_is_named_where_it_is_missing(tmp_path, monkeypatch):
+    write(tmp_path / "arm")
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(ImportError, match=r'needs PyAV: pip install "sb3-dtfm\[video\]"'):
+        load_dataset(tmp_path / "arm")
+
+
+def test_maps_of_numbers_are_not_read_as_vectors(tmp_path):
+    """A map of depth, say; who names it gets its numbers side by side."""
+    folder, depth = tmp_path / "arm", "observation.depth"
+    write(folder, kind="image")
+    told = json.loads((folder / "meta" / "info.json").read_text())
+    told["features"][depth] = {"dtype": "float32", "shape": [20, 16]}
+    (folder / "meta" / "info.json").write_text(json.dumps(told))
+    for number, n_steps in enumerate(LENGTHS):
+        table = pq.read_table(folder / "data" / f"{number}.parquet")
+        maps = np.random.default_rng(number).random((n_steps, 20, 16))
+        pq.write_table(table.append_column(depth, pa.array(maps.tolist())), folder / "data" / f"{number}.parquet")
+    with pytest.warns(UserWarning, match=r"neither vectors nor images, and not read: observation.depth \(float32\)"):
+        assert load_dataset(folder).observations.shape == (13, 2)
+    assert load_dataset(folder, observation_keys=[depth]).observations.shape == (13, 320)
+    told["features"][depth]["shape"] = ["many", [2]]
+    (folder / "meta" / "info.json").write_text(json.dumps(told))
+    with pytest.raises(DatasetError, match=r"shape of observation.depth is .*; whole numbers are expected"):
+        load_dataset(folder)
 
 
 @pytest.mark.parametrize(("rows", "n_found"), [([0, 1], 0), ([0, 2, 1, 2], 2)])

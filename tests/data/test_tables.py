@@ -115,3 +115,21 @@ def test_numbered_columns_come_by_their_numbers(write):
 def test_steps_of_an_episode_lie_side_by_side(write):
     with pytest.raises(DatasetError, match=r"episode a comes in several places; .* as after a stable sort"):
         load_dataset(write({**COLUMNS, "episode": list("ababa")}))
+
+
+@pytest.mark.parametrize("kind", ["DataFrame", "parquet"])
+def test_images_in_a_column_are_told_of_and_read_if_they_are_named(kind, tmp_path):
+    pandas = pytest.importorskip("pandas")
+    images = np.random.default_rng(0).integers(0, 256, (4, 8, 9, 3), dtype=np.uint8)
+    columns = {"obs_0": np.arange(4.0), "action": [0.5] * 4, "reward": [1.0] * 4, "done": [0, 0, 0, 1]}
+    if kind == "parquet":
+        pixels = pa.array(images.tolist(), pa.list_(pa.list_(pa.list_(pa.uint8()))))
+        table = tmp_path / "steps.parquet"
+        pq.write_table(pa.table({**columns, "pixels": pixels}), table)
+    else:
+        table = pandas.DataFrame({**columns, "pixels": list(images)})
+    with pytest.warns(UserWarning, match=r"pixels has an image of shape \(8, 9, 3\) for each step, and is not read"):
+        assert load_dataset(table).image_spaces == {}
+    buffer = load_dataset(table, observation_keys=["obs_0", "pixels"])
+    np.testing.assert_array_equal(buffer.own("pixels").numpy(), images)
+    assert buffer.observations[:, 0].tolist() == [0.0, 1.0, 2.0, 3.0]

@@ -1,11 +1,14 @@
 """The zarr replay buffers of Diffusion Policy: folders and zips, images of bytes or of whole floats, and what is refused."""
 
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
 
+from sb3_dtfm import DTFM
 from sb3_dtfm.data import DatasetError, load_dataset
 
 zarr = pytest.importorskip("zarr")
@@ -157,3 +160,21 @@ def test_chunks_that_are_not_stored_are_told_of(arrays, tmp_path):
         (folder / "data" / name / "0.0").unlink()
     with pytest.warns(UserWarning, match=r"push\.zarr: state: 1 of 1 chunks are not stored, and count as 0"):
         assert not load(folder).observations.any()
+
+
+def test_frames_of_the_published_demonstrations_show_the_tool_where_it_is():
+    """Five steps of two demonstrations by people (Chi et al., 2023): upright, red first, and at the steps' own places."""
+    keys = {"pixels": "img", "agent_pos": "state[:2]"}
+    buffer = load(Path(__file__).with_name("pusht.zarr.zip"), observation_keys=keys)
+    assert buffer.episode_lengths.tolist() == [3, 2]
+    images, positions = buffer.own("pixels").numpy(), buffer.observations.numpy()
+    assert (images.shape, images.dtype) == ((5, 96, 96, 3), np.uint8)
+    for image, (x, y) in zip(images, positions * 96 / 512, strict=True):
+        assert image[round(y), round(x)].tolist() == [78, 126, 255], "the tool is blue"
+    assert (images[0, 0, 0] == 255).all()
+    seen = buffer.windows(th.tensor([1]), 2).observations["pixels"]
+    np.testing.assert_array_equal(seen[0].numpy(), np.moveaxis(images[:2], 3, 1))
+    small = dict(embed_dim=8, n_layers=1, n_heads=1, features_extractor_kwargs=dict(channels=(8, 8), features_dim=8))
+    model = DTFM("MultiInputPolicy", dataset=buffer, batch_size=4, device="cpu", policy_kwargs=small).learn(1)
+    observation = {"observation": positions[0], "pixels": images[0], "return_to_go": np.ones(1), "timestep": np.zeros(1)}
+    assert model.action_space.contains(model.predict(observation, deterministic=True)[0])

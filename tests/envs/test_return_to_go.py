@@ -176,6 +176,13 @@ def test_a_matrix_is_flattened():
     assert env.reset()[0]["observation"].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
 
 
+def test_a_matrix_as_large_as_a_picture_is_told_of(recwarn):
+    ReturnToGoWrapper(ConstantReward(spaces.Box(0.0, 1.0, (15, 84)), None), 0.0)
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match=r"shape \(84, 84\) and becomes a vector of 7056 numbers. If it is an image, give"):
+        ReturnToGoWrapper(ConstantReward(spaces.Dict(seen=spaces.Box(0.0, 1.0, (84, 84))), None), 0.0)
+
+
 @pytest.mark.parametrize(
     ("space", "message"),
     [
@@ -183,6 +190,8 @@ def test_a_matrix_is_flattened():
         (spaces.Dict(arm=spaces.Dict(camera=spaces.Box(0, 255, (64, 64, 3), np.uint8))), "an entry of the Dict that the"),
         (spaces.Dict(observation=spaces.Box(0, 255, (64, 64, 3), np.uint8)), "An image is called observation"),
         (spaces.Box(0, 1, (64, 64, 3)), "looks like an image of float32; images are uint8, 0 to 255"),
+        (spaces.Box(0, 1, (4, 64, 64, 3)), "looks like an image of float32; images are uint8, 0 to 255"),
+        (spaces.Dict(mask=spaces.Box(0, 255, (64, 64, 3), np.uint8)), "An image is called mask, which is the name of some"),
         (spaces.Box(0, 255, (64, 48, 2), np.uint8), r"'image' has shape \(64, 48, 2\), expected 1, 3 or 4 channels, either"),
         (spaces.Box(0, 255, (3, 48, 3), np.uint8), r"'image' has shape \(3, 48, 3\), expected 1, 3 or 4 channels, either"),
         (spaces.Box(0, 9, (48, 48, 3), np.uint8), r"'image' is Box\(0, 9, .*; bounds of 0 and 255 are expected"),

@@ -9,13 +9,13 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import DatasetError, load_dataset
 from sb3_dtfm.envs import ReturnToGoWrapper
-from sb3_dtfm.policies.images import EXTRACTORS, N_CROPS, ResidualExtractor, spatial_softmax
+from sb3_dtfm.policies.images import EXTRACTORS, N_CROPS, ImageEncoder, ResidualExtractor, spatial_softmax
 from tests.algorithms.small import make_model
 from tests.images import CAMERA, make_pixels, record
 
@@ -208,6 +208,9 @@ def test_the_exported_file_acts_alike(buffer, tmp_path):
     model.export(tmp_path / "policy.onnx")
     policy = runpy.run_path(str(DEPLOY))["Policy"](str(tmp_path / "policy.onnx"))
     assert policy.settings["images"] == {CAMERA: [3, 32, 32]}
+    for wrong in (np.zeros((32, 32, 3)), np.zeros((32, 32, 1), np.uint8)):
+        with pytest.raises(ValueError, match=r"pixels: expected uint8 of \[3, 32, 32\], channels first or last; got"):
+            policy.act(np.zeros(3), -100.0, 0, {CAMERA: wrong})
     env = DummyVecEnv([wrapped])
     env.seed(0)
     observation, state, start = env.reset(), None, np.array([True])
@@ -253,6 +256,82 @@ def test_spatial_softmax_finds_the_place():
     th.testing.assert_close(spatial_softmax(maps), th.tensor([[-1.0, 0.0, 1.0, 0.0]]))
 
 
+def encoder(class_name, shapes, kwargs=None, normalize_images=True, shared=False):
+    images = {camera: spaces.Box(0, 255, shape, np.uint8) for camera, shape in shapes.items()}
+    return ImageEncoder(images, class_name, kwargs or {}, normalize_images, shared)
+
+
+@pytest.mark.parametrize(("normalize_images", "largest"), [(True, 1.0), (False, 255.0)])
+def test_each_camera_reaches_its_own_extractor_divided_by_255_or_not(normalize_images, largest, monkeypatch):
+    monkeypatch.setitem(EXTRACTORS, "Means", Means)
+    made, seen = encoder("Means", dict.fromkeys("ab", (3, 4, 5)), normalize_images=normalize_images), {}
+    for camera, extractor in zip("ab", made.extractors, strict=True):
+        extractor.register_forward_pre_hook(lambda _, images, camera=camera: seen.update({camera: images[0]}))
+    dark, bright = th.zeros(2, 3, 4, 5, dtype=th.uint8), th.full((2, 3, 4, 5), 255, dtype=th.uint8)
+    assert made({"a": dark, "b": bright}).shape == (2, 6)
+    assert (seen["a"] == 0.0).all()
+    assert (seen["b"] == largest).all()
+
+
+def test_the_default_crops_nine_tenths():
+    for side, left in ((84, 76), (96, 86), (224, 202)):
+        assert ResidualExtractor(spaces.Box(0, 255, (3, side, side), np.uint8)).size == (left, left)
+
+
+@pytest.mark.parametrize(("side", "channels"), [(12, (32, 64, 64)), (18, (32, 64, 64, 64))])
+def test_images_too_small_for_a_place_to_differ_are_refused(side, channels):
+    def space(n):
+        return spaces.Box(0, 255, (3, n, 60), np.uint8)
+
+    with pytest.raises(ValueError, match=f"of images of {side} x 60 a map of 1 x . is left, in which no place differs"):
+        ResidualExtractor(space(side), channels=channels)
+    larger = ResidualExtractor(space(side + 6), channels=channels).eval()
+    maps = larger.blocks(th.relu(larger.stem(larger._crop(th.rand(1, 3, side + 6, 60)))))
+    assert min(maps.shape[2:]) >= 2
+
+
+def test_extractors_that_cannot_be_made_are_told_of_with_the_camera(episodes, buffer):
+    shapes = {"top": (3, 20, 20)}
+    for class_name, kwargs, message in (
+        (
+            "ResidualExtractor",
+            dict(cnn_output_dim=16),
+            r"ResidualExtractor\(cnn_output_dim=16\) cannot be .* 'top'.*unexpected",
+        ),
+        ("NatureCNN", {}, r"NatureCNN\(\) cannot be made for the camera 'top', whose images have the shape \(3, 20, 20\)"),
+        ("ResidualExtractor", dict(channels=(8, 8, 8, 8, 8)), "a map of 1 x 1 is left"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            encoder(class_name, shapes, kwargs)
+    with pytest.raises(ValueError, match="ResNet18 expects images from 0 to 1: leave normalize_images=True"):
+        encoder("ResNet18", shapes, normalize_images=False)
+    with pytest.raises(
+        ValueError, match=r"share_features_extractor=True needs images of one shape, got \[\(3, 20, 20\), \(3"
+    ):
+        encoder("ResidualExtractor", {**shapes, "hand": (3, 30, 30)}, shared=True)
+    with pytest.raises(
+        ValueError, match="CombinedExtractor takes a Dict; expected is a class that takes one camera's image"
+    ):
+        make(DT, buffer, policy_kwargs=dict(features_extractor_class=CombinedExtractor))
+    assert encoder("ResidualExtractor", shapes, dict(channels=(4, 4))).features_dim == 64
+
+
+def test_images_with_reversed_axes_and_a_state_that_stays_as_it_was(buffer):
+    model = make(DT, buffer)
+    observation, _ = wrapped().reset(seed=0)
+    _, state = model.policy.predict(observation, deterministic=True)
+    before = [np.array(part) for part in state]
+    model.policy.reset()
+    reversed_channels = {**observation, CAMERA: observation[CAMERA][..., ::-1]}
+    copied = {**observation, CAMERA: observation[CAMERA][..., ::-1].copy()}
+    actions = [
+        model.policy.predict(seen, state, np.array([False]), deterministic=True)[0] for seen in (reversed_channels, copied)
+    ]
+    np.testing.assert_array_equal(*actions)
+    for part, kept in zip(state, before, strict=True):
+        np.testing.assert_array_equal(part, kept)
+
+
 def change(episodes, make_image):
     return [[({**seen, CAMERA: make_image(seen[CAMERA])}, *rest) for seen, *rest in steps] for steps in episodes]
 
@@ -264,6 +343,23 @@ def test_unfit_images_are_refused(episodes, buffer):
         DatasetError, match=r"episode 3: images of 'pixels' have shape \(16, 32, 3\), expected \(32, 32, 3\)"
     ):
         load_dataset([*episodes[:3], *change(episodes[3:], lambda image: image[::2])], **BOUNDS)
+    mixed = [*episodes[0][:7], *change([episodes[0][7:]], lambda image: image[::2])[0]]
+    with pytest.raises(
+        DatasetError, match=r"pixels: step 7 has the shape \(16, 32, 3\), expected \(32, 32, 3\) as in step 0"
+    ):
+        load_dataset([mixed], **BOUNDS)
+    nested = [({"cameras": {CAMERA: seen[CAMERA]}, "state": seen["state"]}, *rest) for seen, *rest in episodes[0]]
+    with pytest.raises(DatasetError, match=r"cameras, pixels holds images of shape \(32, 32, 3\) inside of another entry"):
+        load_dataset([nested], **BOUNDS)
+    stacked = [({CAMERA: np.stack([seen[CAMERA] / 255.0] * 4)}, *rest) for seen, *rest in episodes[0]]
+    with pytest.raises(DatasetError, match=r"float64 of shape \(20, 4, 32, 32, 3\), expected images as uint8"):
+        load_dataset([stacked], **BOUNDS)
+    gray = [({CAMERA: seen[CAMERA].mean(axis=2) / 255.0}, *rest) for seen, *rest in episodes[0]]
+    with pytest.warns(UserWarning, match=r"shape \(32, 32\) and becomes a vector of 1024 numbers"):
+        load_dataset([gray], **BOUNDS)
+    named = [({"actions": seen[CAMERA], "state": seen["state"]}, *rest) for seen, *rest in episodes[0]]
+    with pytest.raises(DatasetError, match="An image is called actions, which is the name of something else here"):
+        load_dataset([named], **BOUNDS)
     with pytest.raises(DatasetError, match="expected 1, 3 or 4 channels, either first or last"):
         load_dataset(change(episodes, lambda image: np.concatenate([image, image], axis=2)), **BOUNDS)
     with pytest.raises(DatasetError, match=r"images \{'pixels': \(3, 32, 32\)\}, the environment's are of no camera"):

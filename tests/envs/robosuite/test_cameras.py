@@ -11,15 +11,18 @@ pytestmark = pytest.mark.skipif(BACKEND is None, reason="needs EGL or OSMesa")
 
 SEEN = """
 import shlex
-import gymnasium, h5py, numpy as np, sb3_dtfm.envs
+import gymnasium, h5py, mujoco, numpy as np, sb3_dtfm.envs
 from sb3_dtfm.cli.inspect import command, load
 from sb3_dtfm.data import load_dataset
 from sb3_dtfm.data.inspection import inspect_buffer
 from sb3_dtfm.envs import ReturnToGoWrapper
-from sb3_dtfm.recording.demonstrations import record_demonstrations
+from sb3_dtfm.cli.main import main
 cameras = ["agentview", "robot0_eye_in_hand"]
-record_demonstrations("lift", 1, "lift.hdf5", n_workers=1, progress=False, cameras=cameras, camera_size=48)
+assert not main(["record", "--demonstrator", "lift", "--camera", *cameras, "--camera-size", "48", "--episodes", "2",
+                 "--output", "lift.hdf5"])
 env = gymnasium.make("robosuite/Lift-v0", cameras=cameras, camera_size=48)
+flags = env.unwrapped._cameras._renderer.scene.flags
+assert not any(flags[flag] for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION))
 keys = ["agentview_image", "robot0_eye_in_hand_image", "robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"]
 print(list(env.observation_space))
 buffer = load_dataset("lift.hdf5", observation_keys=keys)
@@ -54,4 +57,4 @@ def test_recorded_images_are_the_observed_ones(tmp_path, monkeypatch):
     unknown = "cameras: there is no nowhere; accepted are frontview, birdvi"
     seen = ["agentview_image", "robot0_eye_in_hand_image"]
     told = "--env-kwargs cameras:['agentview', 'robot0_eye_in_hand'] camera_size:48"
-    assert result.stdout.splitlines() == [str(keys), told, " ".join(seen), below, unknown], result.stderr
+    assert result.stdout.splitlines()[-5:] == [str(keys), told, " ".join(seen), below, unknown], result.stderr
