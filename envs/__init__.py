@@ -8,21 +8,23 @@ from sb3_dtfm.envs.robotics import AdroitReward, register_gymnasium_robotics, wa
 
 if TYPE_CHECKING:
     from sb3_dtfm.envs.cameras import RenderWrapper, resize_image
-    from sb3_dtfm.envs.return_to_go import (
-        BETWEEN,
+    from sb3_dtfm.envs.observation_spaces import (
         OBSERVATION,
         RETURN_TO_GO,
         TIMESTEP,
-        ReturnToGoWrapper,
         channels_first,
-        check_vec_env,
         flatten_observation_space,
         image_spaces,
+        return_to_go_space,
+        without_images,
+    )
+    from sb3_dtfm.envs.return_to_go import (
+        BETWEEN,
+        ReturnToGoWrapper,
+        check_vec_env,
         known_task,
         recorded_space,
-        return_to_go_space,
         share_target_return,
-        without_images,
     )
 
 register_go1_env()
@@ -57,6 +59,6 @@ def __getattr__(name: str) -> Any:
     """The wrapper and what comes with it, when they are asked for: Stable-Baselines3 takes seconds to import."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from sb3_dtfm.envs import cameras, return_to_go
+    from sb3_dtfm.envs import cameras, observation_spaces, return_to_go
 
-    return getattr(cameras if hasattr(cameras, name) else return_to_go, name)
+    return next(getattr(module, name) for module in (cameras, observation_spaces, return_to_go) if hasattr(module, name))

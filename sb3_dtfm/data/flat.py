@@ -22,7 +22,7 @@ from sb3_dtfm.data.observations import Observed, is_images, observed, part_of
 from sb3_dtfm.data.short_episodes import ShortEpisodes, blocks
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import ActionRangeError, DatasetError, Trajectory
-from sb3_dtfm.envs.return_to_go import CHANNELS, IMAGE
+from sb3_dtfm.envs.observation_spaces import CHANNELS, IMAGE
 from sb3_dtfm.envs.success import SUCCESS
 from sb3_dtfm.files import warn
 

@@ -17,7 +17,7 @@ from sb3_dtfm.data.flat import bounded_space, fitted, json_options, warn_of_made
 from sb3_dtfm.data.lerobot_images import DATA, EPISODE, FRAME, IMAGE, INFO, TIME, VIDEO, Cameras, Columns
 from sb3_dtfm.data.storage import FileStorage
 from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_flags, wrap_dataset_errors
-from sb3_dtfm.envs.return_to_go import SMALLEST_PICTURE
+from sb3_dtfm.envs.observation_spaces import SMALLEST_PICTURE
 from sb3_dtfm.files import warn
 
 ACTION, REWARDS, SUCCESS, DONE = "action", ("next.reward", "reward"), "next.success", "next.done"

@@ -14,7 +14,7 @@ from sb3_dtfm.data.cache import files_below
 from sb3_dtfm.data.image_files import decode_images
 from sb3_dtfm.data.trajectories import DatasetError, check_size, wrap_dataset_errors
 from sb3_dtfm.data.videos import read_frames
-from sb3_dtfm.envs.return_to_go import CHANNELS
+from sb3_dtfm.envs.observation_spaces import CHANNELS
 
 INFO, DATA, EPISODES = "meta/info.json", "data", "meta/episodes"
 EPISODE, FRAME, TIME = "episode_index", "frame_index", "timestamp"

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_dtfm.data.trajectories import DatasetError, check_real
-from sb3_dtfm.envs.return_to_go import (
+from sb3_dtfm.envs.observation_spaces import (
     IMAGE,
     flatten_observation_space,
     image_spaces,

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_dtfm.actions import ActionSpace
-from sb3_dtfm.envs.return_to_go import check_cameras, check_image_shape
+from sb3_dtfm.envs.observation_spaces import check_cameras, check_image_shape
 from sb3_dtfm.files import printable
 
 # Recorded float64 actions may pass a float32 bound by a rounding error; beyond this share of the range they are wrong.

@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_dtfm import DT
 from sb3_dtfm.data import DatasetError, Trajectory, load_dataset
 from sb3_dtfm.envs import ReturnToGoWrapper
-from sb3_dtfm.envs.return_to_go import sort_observation_space
+from sb3_dtfm.envs.observation_spaces import sort_observation_space
 
 LENGTHS, N_ACTIONS = (3, 5), 2
 
