@@ -6,8 +6,8 @@ OGBench's `play` data sets (Park et al., 2025), recorded anew by the oracles tha
     .venv-ogbench/bin/python studies/ogbench/play.py cube-single datasets/ogbench/cube-single-play-v0.npz
 
 The file has the layout of the published ones. Its episodes have 1,001 steps: an oracle follows its plan, with noise, to a
-random target, and when it is done another target is drawn. An episode depends on its number and the seed alone. Parts lie in
-a folder beside the file until all are there, and the same command continues after a kill.
+random target, and when it is done another target is drawn. On one kind of processor an episode depends on its number and the
+seed alone. Parts lie in a folder beside the file until all are there, and the same command continues after a kill.
 """
 
 # This folder has no __init__.py, so that `import ogbench` finds the package and not the folder.
