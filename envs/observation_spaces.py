@@ -16,13 +16,11 @@ TIMESTEP = "timestep"
 IMAGE = "image"
 # Numbers of channels that images have.
 CHANNELS = (1, 3, 4)
-# Sides of a matrix that may be a picture, pixels.
+# Sides of what may be an image of several channels, pixels, and of a matrix that may be one.
+SMALLEST_IMAGE = 8
 SMALLEST_PICTURE = 16
-# Names of a step's arrays and of an exported file's inputs, which no image may have.
-RESERVED = {
-    *(OBSERVATION, RETURN_TO_GO, TIMESTEP, "observations", "actions", "rewards", "returns_to_go"),
-    *("timesteps", "mask", "noise", "features", "keys_values", "episode_keys"),
-}
+# Names of what ReturnToGoWrapper shows and of a step's arrays, which no image may have.
+RESERVED = {OBSERVATION, RETURN_TO_GO, TIMESTEP, "observations", "actions", "rewards", "returns_to_go"}
 
 
 def image_spaces(space: spaces.Space) -> dict[str, spaces.Box]:
@@ -58,7 +56,11 @@ def looks_like_images(shape: tuple[int, ...]) -> bool:
 
     :param shape: of a step
     """
-    return len(shape) > 3 or (len(shape) == 3 and bool({shape[0], shape[2]} & set(CHANNELS)))
+    if len(shape) < 3:
+        return False
+    *_, first, second, third = shape
+    last, leading = third in CHANNELS and min(first, second), first in CHANNELS and min(second, third)
+    return max(last, leading) >= SMALLEST_IMAGE
 
 
 def warn_if_a_picture(shape: tuple[int, ...]) -> None:
@@ -142,10 +144,11 @@ def check_cameras(images: Iterable[str]) -> None:
     Refuse images whose names stand for something else.
 
     :param images: their names
-    :raises ValueError: a name of what ReturnToGoWrapper shows, of a step's arrays, or of an exported file's inputs
+    :raises ValueError: a name of what ReturnToGoWrapper shows, or of a step's arrays
     """
     if taken := sorted(RESERVED.intersection(images)):
-        raise ValueError(f"An image is called {', '.join(taken)}, which is the name of something else here; rename it.")
+        reserved = ", ".join(sorted(RESERVED))
+        raise ValueError(f"An image is called {', '.join(taken)}; other names than {reserved} are expected.")
 
 
 def _boxes(space: spaces.Space) -> Iterator[spaces.Box]:

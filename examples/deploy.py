@@ -48,12 +48,11 @@ class Policy:
         """
         for camera, shape in self.settings["images"].items():
             image = (images or {})[camera]
-            image = image if list(image.shape) == shape else np.moveaxis(image, -1, 0)
-            if image.dtype != np.uint8 or list(image.shape) != shape:
-                raise ValueError(
-                    f"{camera}: expected uint8 of {shape}, channels first or last; got {image.dtype}, {image.shape}"
-                )
-            self.inputs[camera][0] = image
+            first = image if list(image.shape) == shape else np.moveaxis(image, -1, 0)
+            if image.dtype != np.uint8 or list(first.shape) != shape:
+                found = f"{image.dtype} of {image.shape}"
+                raise ValueError(f"{camera}: expected uint8 of {shape}, channels first or last; got {found}.")
+            self.inputs[camera][0] = first
         if timestep == 0:
             self.inputs["mask"][:], self.plan = False, []
             if "episode_keys" in self.inputs:

@@ -33,6 +33,7 @@ ACTION_SCALE = 0.5  # rad
 PERIOD = 0.02  # seconds
 PATIENCE = 0.06  # seconds without a command after which the watchdog stops the robot
 OLDEST = 0.04  # seconds, age of a measurement
+GIVING_UP = 1.0  # seconds in which the watchdog tries to stop a robot at the end
 STEEPEST = 0.5  # cosine of the trunk's tilt
 FASTEST = 30.0  # rad/s, of a joint
 STANDING_UP = 2.0  # seconds
@@ -134,9 +135,11 @@ class Guard:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.stop("the end")  # if this fails, the watchdog tries again
-        self._over.set()
-        self._watchdog.join(self.patience)
+        try:
+            self.stop("the end")
+            self._over.set()
+        finally:  # where the robot has not taken it, the watchdog tries for a while
+            self._watchdog.join(GIVING_UP)
 
     def stop(self, reason: str) -> None:
         """Let the robot sink down, for good. The first reason stays."""
@@ -186,8 +189,9 @@ class Guard:
         :param measured: present positions and velocities
         :raises StoppedError: a target is not finite, or the watchdog was faster
         """
-        if not (np.isfinite(targets).all() and np.isfinite(measured.positions + measured.velocities).all()):
-            self.give_up("a target is not finite")
+        for numbers, name in ((targets, "target"), (measured.positions + measured.velocities, "position or velocity")):
+            if not np.isfinite(numbers).all():
+                self.give_up(f"a {name} is not finite")
         without_torque = measured.positions + KD / KP * measured.velocities
         near = np.clip(targets, without_torque - TORQUE / KP, without_torque + TORQUE / KP)
         with self._lock:
@@ -202,15 +206,16 @@ class Guard:
     def _watch(self) -> None:
         while not self._over.wait(PERIOD):
             if time.monotonic() - self._fed > self.patience:
-                with contextlib.suppress(Exception):  # then once more, until the robot takes it
+                with contextlib.suppress(Exception):  # then once more
                     self.stop(f"no command came for more than {self.patience * 1e3:.0f} ms")
-                    return
 
 
-def move(guard: Guard, pose: np.ndarray, seconds: float) -> None:
-    """Lead the joints to a pose in even steps, from the targets that carry the robot at present."""
+def move(guard: Guard, pose: np.ndarray, seconds: float, ended: threading.Event | None = None) -> None:
+    """Lead the joints to a pose in even steps, from the targets that carry the robot at present, until `ended` is set."""
     start = guard.read().positions if guard.targets is None else guard.targets
     for share in np.linspace(0.0, 1.0, round(seconds / PERIOD) + 1)[1:]:
+        if ended is not None and ended.is_set():
+            return
         guard.send(start + share * (pose - start), guard.read())
         guard.robot.wait()
 
@@ -252,19 +257,40 @@ def walk(guard: Guard, policy: Policy, command: np.ndarray, n_steps: int, ended:
 
 @contextlib.contextmanager
 def ended_by_keyboard() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; the second lets the robot sink down."""
+    """An event that the first Ctrl-C sets; the second lets the robot sink down, and further ones change nothing."""
     ended = threading.Event()
 
+    def sink(*_: Any) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
     def end(*_: Any) -> None:
-        print("Interrupted; lying down. Once more lets the robot sink down at once.")
         ended.set()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, sink)
+        print("Interrupted; lying down. Once more lets the robot sink down at once.")
 
     earlier = signal.signal(signal.SIGINT, end)
     try:
         yield ended
     finally:
         signal.signal(signal.SIGINT, earlier)
+
+
+def check_command(command: np.ndarray) -> None:
+    """
+    :raises ValueError: a command beyond `LARGEST_COMMAND`
+    """
+    if not (np.abs(command) <= LARGEST_COMMAND).all():
+        raise ValueError(
+            f"command {command.tolist()} is beyond {LARGEST_COMMAND.tolist()}, which training asked for at most."
+        )
+
+
+def terminate(*_: Any) -> None:
+    """Let the robot sink down, whatever signals follow."""
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_IGN)
+    sys.exit("Terminated; the robot sinks down.")
 
 
 def run(robot: Robot, policy: Policy, command: np.ndarray, seconds: float, patience: float = PATIENCE) -> list[float]:
@@ -276,13 +302,10 @@ def run(robot: Robot, policy: Policy, command: np.ndarray, seconds: float, patie
     :raises ValueError: a command beyond `LARGEST_COMMAND`
     :raises StoppedError: by a limit or the watchdog
     """
-    if not (np.abs(command) <= LARGEST_COMMAND).all():
-        raise ValueError(
-            f"command {command.tolist()} is beyond {LARGEST_COMMAND.tolist()}, which training asked for at most."
-        )
+    check_command(command)
     policy.act(np.zeros(45, np.float32), 0.0, 0)  # the first call takes longer than the watchdog waits
     with ended_by_keyboard() as ended, Guard(robot, patience) as guard:
-        move(guard, HOME, STANDING_UP)
+        move(guard, HOME, STANDING_UP, ended)
         milliseconds = walk(guard, policy, command, round(seconds / PERIOD), ended)
         move(guard, DOWN, STANDING_UP)
     return milliseconds
@@ -296,13 +319,15 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=float, default=0.0, metavar="SPEED", help=f"{unit}; 0 by default")
     parser.add_argument("--seconds", type=float, default=20.0, help="20 by default")
     options = parser.parse_args()
-    robot: Any = SimulatedRobot(options.model_file)
     command = np.array([options.forward, options.left, options.turn])
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit("Terminated; the robot sinks down."))
     try:
-        milliseconds = run(robot, Policy(options.policy), command, options.seconds)
+        check_command(command)
     except ValueError as error:
         parser.error(str(error))
+    robot: Any = SimulatedRobot(options.model_file)
+    signal.signal(signal.SIGTERM, terminate)
+    try:
+        milliseconds = run(robot, Policy(options.policy), command, options.seconds)
     except StoppedError as error:
         raise SystemExit(f"The robot was stopped: {error}.") from error
     if milliseconds:

@@ -225,7 +225,7 @@ class _Table(Arrays):
     def describe(self, name: str) -> tuple[tuple[int, ...], np.dtype] | None:
         column = self._columns[name]
         first = next(iter(column), None)
-        with contextlib.suppress(ValueError):  # lists of different lengths
+        with contextlib.suppress(Exception):  # lists of different lengths
             array = np.asarray(first)
             return ((len(column), *array.shape), array.dtype) if array.dtype != object else None
         return None
@@ -233,9 +233,9 @@ class _Table(Arrays):
     def _get(self, name: str, where: str) -> Any:
         column = self._columns[name]
         array = np.asarray(column.to_numpy() if hasattr(column, "to_numpy") else column)
-        nested = array.dtype == object and array.size > 0 and isinstance(array[0], np.ndarray | list | tuple)
         with wrap_dataset_errors(where, NUMBERS_EXPECTED):
-            return np.stack(list(array)) if nested else array
+            nested = array.dtype == object and array.size > 0 and np.ndim(np.asarray(array[0])) > 0
+            return np.stack([np.asarray(entry) for entry in array]) if nested else array
 
 
 class _Parquet(Arrays):
@@ -251,7 +251,7 @@ class _Parquet(Arrays):
         self._file = file
 
     def describe(self, name: str) -> tuple[tuple[int, ...], np.dtype] | None:
-        with contextlib.suppress(DatasetError):  # no rows, lists of different lengths, or no numbers
+        with contextlib.suppress(Exception):  # no rows, lists of different lengths, or no numbers
             for row in self._file.iter_batches(batch_size=1, columns=[name]):
                 found = as_numbers(row.column(0), name)
                 return (self._file.metadata.num_rows, *found.shape[1:]), found.dtype

@@ -38,6 +38,7 @@ def as_numbers(values: Any, where: str) -> np.ndarray:
     if not n_rows:
         raise DatasetError(f"{where} has no rows; a row for each step is expected.")
     pyarrow = import_pyarrow(where)
+    shape = getattr(values.type, "shape", None)  # of tensors
     if isinstance(values, pyarrow.ExtensionArray):
         values = values.storage
     axes = []
@@ -45,8 +46,8 @@ def as_numbers(values: Any, where: str) -> np.ndarray:
         sizes = np.unique(pyarrow.compute.list_value_length(values).fill_null(0))
         if len(sizes) > 1:
             raise DatasetError(f"{where} holds lists of {sizes[0]} to {sizes[-1]} entries; one length is expected.")
-        axes.append(int(sizes[0]))
+        axes.append(int(sizes[0]) if len(sizes) else 0)
         values = values.flatten()
     array = values.to_numpy(zero_copy_only=False)
     check_real(array.dtype, where)
-    return array.reshape(n_rows, *axes)
+    return array.reshape(n_rows, *(shape or axes))

@@ -170,7 +170,7 @@ def _kind_of_actor(errors: PredictionErrors | None, correlation: float, seen: st
     # Scripts depend on the time step: it raised success on Lift from 34 to 46 %, ten demonstrations and batches of 256.
     settings = {"chunk_size": CHUNK_SIZE if plans else 1, **flow, "timestep_embedding": plans}
     better, worse = ("the previous action", seen) if plans else (seen, "the previous action")
-    reason = f"T{better[1:]} predicts actions better than {worse} does (ratio of squared errors {ratio or 0.0:.3g})."
+    reason = f"{better.capitalize()} predicts actions better than {worse} does (ratio of squared errors {ratio or 0.0:.3g})."
     if ratio is None:
         reason = f"There are too few episodes to compare how {seen} and the previous action predict actions."
     # Ten scripted demonstrations of Lift: 76 % success with "std", 43 % with "robust"; human Adroit door: 6 and 49 %.

@@ -180,6 +180,8 @@ def load_flat(
 
 def _entries(arrays: Arrays, space: spaces.Space | None, others: Collection[str]) -> list[str]:
     """Arrays of an environment's entries, sorted by the entry, if each has one of its name and its size."""
+    if arrays.are_columns and any(name.startswith(OBSERVATIONS) for name in arrays.names):  # a table's own
+        return []
     parts = space.spaces if isinstance(space, spaces.Dict) else {}
     others = {*others, *ACTIONS, *REWARDS, *SUCCESSES, *ENDS_OF_EPISODES}
     keys = []
@@ -273,6 +275,8 @@ def _actions(arrays: Arrays, keys: Sequence[str], space: ActionSpace | None) -> 
     numbers = isinstance(space, spaces.Box) or (arrays.are_columns and actions.dtype.kind == "f")
     if actions.ndim == 1 and (numbers or keys[0] not in ACTIONS):
         actions = actions[:, None]
+    if actions.ndim > 2 and arrays.are_columns:  # lists of lists
+        actions = actions.reshape(len(actions), -1)
     if len(keys) > 1 and len(actions):
         n_steps = len(actions)
         actions = np.concatenate([arrays.read((key,), n_steps).reshape(n_steps, -1) for key in keys], axis=1)

@@ -163,9 +163,8 @@ def _info(folder: Path, source: str) -> dict[str, Any]:
         for name, each in info["features"].items():
             if not isinstance(each["dtype"], str):
                 raise DatasetError(f"{source}: {INFO}: dtype of {name} is {each['dtype']!r:.20}; a word is expected.")
-            shape = each.get("shape", [])
-            if not isinstance(shape, list) or (each["dtype"] in NUMBERS and not all(map(COUNT.accepts, shape))):
-                raise DatasetError(f"{source}: {INFO}: shape of {name} is {shape!r:.20}; whole numbers are expected.")
+            if not isinstance(each.get("shape", []), list):
+                raise DatasetError(f"{source}: {INFO}: shape of {name} is {each['shape']!r:.20}; a list is expected.")
         return info
 
 
@@ -190,18 +189,15 @@ def _names(
         raise DatasetError(f"{source}: has no feature {ACTION!r} of numbers, only {', '.join(known)}.")
     if not names:
         raise DatasetError(
-            f"{source}: no feature of numbers or images begins with {OBSERVATION!r}, only {', '.join(known)}."
+            f"{source}: no vector or image begins with {OBSERVATION!r}; observation_keys chooses among {', '.join(known)}."
         )
     return names
 
 
-def _is_map(dtype: str, shape: list[int]) -> bool:
+def _is_map(dtype: str, shape: list[Any]) -> bool:
     """Return whether a feature of numbers has a picture's shape, such as a map of depth."""
-    return (
-        dtype in NUMBERS
-        and len(shape) > 1
-        and (WHOLE.match(dtype) is not None or len(shape) > 2 or min(shape) >= SMALLEST_PICTURE)
-    )
+    n_large = sum(PIXELS.accepts(side) and side >= SMALLEST_PICTURE for side in shape)
+    return dtype in NUMBERS and len(shape) > 1 and (WHOLE.match(dtype) is not None or n_large > 1)
 
 
 def _size(size: Any) -> tuple[int, int]:

@@ -121,7 +121,9 @@ def in_space(observations: Any, space: spaces.Space | None, where: str) -> np.nd
             there = ", ".join(map(str, observations))
             raise DatasetError(f"{where} has no {', '.join(missing)}, which the environment observes, only {there}.")
         return np.concatenate([in_space(observations[key], parts[key], f"{where}, {key}") for key in sorted(parts)], axis=1)
-    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete) and not isinstance(observations, Mapping):
+    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary) and not isinstance(
+        observations, Mapping
+    ):
         array = np.asarray(observations)
         if array.shape[1:] in (space.shape, (math.prod(space.shape or ()),)):
             return flatten_observations(lambda *_: array, (), space, where)[0]
@@ -249,7 +251,7 @@ def flatten_chosen(read: ReadArray, chosen: Chosen, where: str) -> list[np.ndarr
 
 def check_no_images(array: np.ndarray, where: str) -> None:
     """
-    Refuse what the wrapper refuses in an environment.
+    Refuse what the wrapper refuses in an environment, and tell of what it tells of.
 
     :param array: (T, ...)
     :param where: whose it is, for messages

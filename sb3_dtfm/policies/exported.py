@@ -120,6 +120,7 @@ class ExportedPolicy(nn.Module):
         Inputs of :meth:`forward` by name, those that this policy takes: full windows of random numbers.
 
         :param n_rows: B
+        :raises ValueError: an image has the name of another input
         """
         shape, trunk, noise_dim = (n_rows, self.context_length), self.network.trunk, self.settings["noise_dim"]
         generator = th.Generator().manual_seed(0)
@@ -142,6 +143,8 @@ class ExportedPolicy(nn.Module):
             inputs["keys_values"] = draw(n_rows, trunk.n_layers, 2, n_kept, trunk.embed_dim)
         if self.network.encoder is not None:
             inputs["features"] = draw(*shape, self.network.encoder.features_dim)
+            if taken := sorted(inputs.keys() & self.settings["images"]):
+                raise ValueError(f"export: an image is called {', '.join(taken)}, as an input of the file; rename it.")
             inputs["images"] = {
                 camera: th.randint(0, 256, (n_rows, *size), dtype=th.uint8, generator=generator)
                 for camera, size in self.settings["images"].items()

@@ -55,7 +55,7 @@ class ResidualExtractor(BaseFeaturesExtractor):
         self.size = (round(crop * height), round(crop * width))
         # What the stem and the blocks but the last leave of each side.
         left = [-(-((side - 4) // 4 + 1) // 2 ** (len(channels) - 2)) for side in self.size]
-        if min(left) < 2:
+        if min(left) < 1 or max(left) < 2:
             raise ValueError(
                 f"of images of {height} x {width} a map of {max(0, left[0])} x {max(0, left[1])} is left, in which no place "
                 "differs; larger images or fewer channels are expected."

@@ -29,6 +29,8 @@ TRAIN_EXAMPLES = """\
 
 # In a run's folder: how it was started.
 START = "start.json"
+# Task of RL-Zoo where none is named.
+RL_ZOO_ENV = "CartPole-v1"
 
 
 class UsageError(ValueError):
@@ -222,7 +224,7 @@ def train_parser() -> argparse.ArgumentParser:
     )
     shared = parser.add_argument_group("read on the way to RL-Zoo").add_argument
     shared("--algo", default="ppo", help=argparse.SUPPRESS)
-    shared("--env", default="CartPole-v1", help=argparse.SUPPRESS)
+    shared("--env", help=argparse.SUPPRESS)
     shared("-params", "--hyperparams", nargs="+", action="extend", default=[], help=argparse.SUPPRESS)
     shared("--gym-packages", nargs="+", default=[], help=argparse.SUPPRESS)
     return parser
@@ -284,10 +286,11 @@ def train_arguments(argv: Sequence[str]) -> list[str]:
     The shorthands become hyperparameters. They are merged with the user's own, since RL-Zoo keeps only the last `-params`.
 
     :param argv: the user's arguments
-    :raises UsageError: a shorthand for an algorithm that knows no dataset, or one that is missing
+    :raises UsageError: no task, a shorthand for an algorithm that knows no dataset, or one that is missing
     """
     options, rest = train_parser().parse_known_args(argv)
     check_algorithm(options.algo)
+    options.env = options.env or _no_env(options.algo)
     check_env_id(options.env)
     if options.algo == FINETUNED:
         raise UsageError(f"--algo {FINETUNED}: such models come from `sb3-dtfm finetune`; `enjoy` plays them.")
@@ -313,6 +316,20 @@ def train_arguments(argv: Sequence[str]) -> list[str]:
     if hyperparams:
         arguments += ["--hyperparams", *hyperparams]
     return arguments
+
+
+def _no_env(algo: str) -> str:
+    """
+    The task where none is named: RL-Zoo's, for its own algorithms.
+
+    :raises UsageError: another algorithm
+    """
+    if algo in ALGORITHMS:
+        raise UsageError(
+            f"--env: {algo} needs the Gymnasium id of its task; `sb3-dtfm inspect DATASET` tells whether the data name one. "
+            f'Without an environment learn in Python: {algo.upper()}("MultiInputPolicy", dataset=...).'
+        )
+    return RL_ZOO_ENV
 
 
 def check_algorithm(algo: str) -> None:

@@ -133,3 +133,40 @@ def test_images_in_a_column_are_told_of_and_read_if_they_are_named(kind, tmp_pat
     buffer = load_dataset(table, observation_keys=["obs_0", "pixels"])
     np.testing.assert_array_equal(buffer.own("pixels").numpy(), images)
     assert buffer.observations[:, 0].tolist() == [0.0, 1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize("first", [[], None])
+def test_a_column_of_lists_that_nobody_needs_may_hold_anything(first, tmp_path):
+    steps = {"obs_0": [0.0, 1.0], "action": [[[0.5, 0.1], [0.2, 0.3]]] * 2, "reward": [1.0, 1.0], "done": [0, 1]}
+    boxes = pa.array([first, [[1.0, 2.0], [3.0]]], pa.list_(pa.list_(pa.float64())))
+    pq.write_table(pa.table({**steps, "detected": boxes}), tmp_path / "steps.parquet")
+    buffer = load_dataset(tmp_path / "steps.parquet")
+    np.testing.assert_allclose(buffer.actions[0].numpy(), [0.5, 0.1, 0.2, 0.3])
+
+
+def test_tensors_of_arrow_keep_their_shape(tmp_path):
+    images = np.random.default_rng(0).integers(0, 256, (2, 8, 9, 3), dtype=np.uint8)
+    columns = {"obs_0": pa.array([0.0, 1.0]), "action": pa.array([0.5, 0.1]), "reward": pa.array([1.0, 1.0])}
+    tensors = pa.FixedShapeTensorArray.from_numpy_ndarray(images)
+    pq.write_table(pa.table({**columns, "done": pa.array([0, 1]), "pixels": tensors}), tmp_path / "steps.parquet")
+    buffer = load_dataset(tmp_path / "steps.parquet", observation_keys=["obs_0", "pixels"])
+    np.testing.assert_array_equal(buffer.own("pixels").numpy(), images)
+
+
+def test_pictures_of_pillow_in_a_column(tmp_path):
+    pandas, image = pytest.importorskip("pandas"), pytest.importorskip("PIL.Image")
+    images = np.random.default_rng(0).integers(0, 256, (2, 8, 9, 3), dtype=np.uint8)
+    columns = {"obs_0": [0.0, 1.0], "action": [0.5, 0.1], "reward": [1.0, 1.0], "done": [0, 1]}
+    table = pandas.DataFrame({**columns, "pixels": [image.fromarray(each) for each in images]})
+    buffer = load_dataset(table, observation_keys=["obs_0", "pixels"])
+    np.testing.assert_array_equal(buffer.own("pixels").numpy(), images)
+
+
+def test_columns_of_an_environments_entries_are_read_where_there_are_none_that_begin_with_obs():
+    pandas = pytest.importorskip("pandas")
+    columns = {"b": [0.0, 1.0], "a": [2.0, 3.0], "action": [0.5, 0.1], "reward": [1.0, 1.0], "done": [0, 1]}
+    space = spaces.Dict(a=spaces.Box(-9, 9, (1,)), b=spaces.Box(-9, 9, (1,)))
+    named = load_dataset(pandas.DataFrame(columns), observation_space=space)
+    np.testing.assert_array_equal(named.observations.numpy(), [[2.0, 0.0], [3.0, 1.0]])
+    own = load_dataset(pandas.DataFrame({**columns, "obs_0": [7.0, 8.0]}), observation_space=space)
+    assert own.observations.tolist() == [[7.0], [8.0]]

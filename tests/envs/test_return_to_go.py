@@ -18,7 +18,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from sb3_dtfm.data import load_minari
+from sb3_dtfm.data import load_dataset, load_minari
 from sb3_dtfm.envs import (
     ReturnToGoWrapper,
     check_vec_env,
@@ -176,6 +176,21 @@ def test_a_matrix_is_flattened():
     assert env.reset()[0]["observation"].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
 
 
+@pytest.mark.parametrize(
+    "space", [spaces.Box(0.0, 1.0, (2, 3, 5, 6)), spaces.Box(0.0, 1.0, (1, 1, 7)), spaces.MultiBinary((20, 30, 3))]
+)
+def test_numbers_with_several_axes_are_flattened_alike_in_environments_and_data(space, recwarn):
+    space.seed(0)
+    observation = space.sample()
+    env = ReturnToGoWrapper(ConstantReward(space, observation), 0.0)
+    seen = env.reset()[0]["observation"]
+    np.testing.assert_array_equal(seen, observation.ravel())
+    episode = {"observations": np.stack([observation] * 2), "actions": np.zeros((2, 1)), "rewards": [0.0, 1.0]}
+    buffer = load_dataset([episode], observation_space=space)
+    np.testing.assert_array_equal(buffer.observations[0].numpy(), seen)
+    assert not [each for each in recwarn if "becomes a vector" in str(each.message)]
+
+
 def test_a_matrix_as_large_as_a_picture_is_told_of(recwarn):
     ReturnToGoWrapper(ConstantReward(spaces.Box(0.0, 1.0, (15, 84)), None), 0.0)
     assert not recwarn.list
@@ -191,7 +206,7 @@ def test_a_matrix_as_large_as_a_picture_is_told_of(recwarn):
         (spaces.Dict(observation=spaces.Box(0, 255, (64, 64, 3), np.uint8)), "An image is called observation"),
         (spaces.Box(0, 1, (64, 64, 3)), "looks like an image of float32; images are uint8, 0 to 255"),
         (spaces.Box(0, 1, (4, 64, 64, 3)), "looks like an image of float32; images are uint8, 0 to 255"),
-        (spaces.Dict(mask=spaces.Box(0, 255, (64, 64, 3), np.uint8)), "An image is called mask, which is the name of some"),
+        (spaces.Dict(rewards=spaces.Box(0, 255, (64, 64, 3), np.uint8)), "An image is called rewards; other names than act"),
         (spaces.Box(0, 255, (64, 48, 2), np.uint8), r"'image' has shape \(64, 48, 2\), expected 1, 3 or 4 channels, either"),
         (spaces.Box(0, 255, (3, 48, 3), np.uint8), r"'image' has shape \(3, 48, 3\), expected 1, 3 or 4 channels, either"),
         (spaces.Box(0, 9, (48, 48, 3), np.uint8), r"'image' is Box\(0, 9, .*; bounds of 0 and 255 are expected"),

@@ -46,9 +46,17 @@ def test_conf_file_defaults_to_the_packaged_one_and_paper_is_packaged(algo):
 
 
 def test_any_other_conf_file_stays():
-    assert zoo_reads(train_arguments(["--algo", "dtfm", "--conf-file=mine.yml"])).conf_file == "mine.yml"
+    assert zoo_reads(train_arguments(["--algo", "dtfm", *ENV, "--conf-file=mine.yml"])).conf_file == "mine.yml"
     assert zoo_reads(train_arguments(["--algo", "sac"])).conf_file is None
     assert zoo_reads(train_arguments(["--algo", "sac", "--conf-file", "small"])).conf_file == "small"
+
+
+def test_offline_algorithms_need_a_task_and_others_have_rl_zoos():
+    with pytest.raises(
+        UsageError, match=r'--env: dtfm needs the Gymnasium id of its task.*Python: DTFM\("MultiInputPolicy"'
+    ):
+        train_arguments(["--algo", "dtfm", "--dataset", "a.npz"])
+    assert zoo_reads(train_arguments(["--algo", "sac"])).env == "CartPole-v1"
 
 
 def test_ppo_on_a_task_of_this_package_has_packaged_settings():
