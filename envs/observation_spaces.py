@@ -17,7 +17,7 @@ IMAGE = "image"
 # Numbers of channels that images have.
 CHANNELS = (1, 3, 4)
 # Sides of what may be an image of several channels, pixels, and of a matrix that may be one.
-SMALLEST_IMAGE = 8
+SMALLEST_IMAGE = 4
 SMALLEST_PICTURE = 16
 # Names of what ReturnToGoWrapper shows and of a step's arrays, which no image may have.
 RESERVED = {OBSERVATION, RETURN_TO_GO, TIMESTEP, "observations", "actions", "rewards", "returns_to_go"}
