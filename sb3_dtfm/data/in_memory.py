@@ -33,6 +33,9 @@ from sb3_dtfm.data.trajectories import DatasetError, Trajectory, check_action_sp
 from sb3_dtfm.envs.success import reported_success
 from sb3_dtfm.files import warn
 
+# Rows of a replay buffer that are compared at once: images of all would take its memory twice more.
+BLOCK = 1000
+
 
 def load_steps(
     steps: Sequence[Any],
@@ -258,8 +261,10 @@ def _breaks(replay_buffer: ReplayBuffer, order: np.ndarray) -> np.ndarray:
     before: Any = replay_buffer.observations
     after: Any = replay_buffer.next_observations
     for key in before if isinstance(before, dict) else (...,):
-        came, seen = after[key][order[:-1]], before[key][order[1:]]
-        breaks |= (came != seen).any(axis=tuple(range(2, seen.ndim)))
+        for start in range(0, len(breaks), BLOCK):
+            rows = slice(start, start + BLOCK)
+            came, seen = after[key][order[:-1][rows]], before[key][order[1:][rows]]
+            breaks[rows] |= (came != seen).any(axis=tuple(range(2, seen.ndim)))
     return breaks
 
 

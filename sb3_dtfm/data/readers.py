@@ -143,6 +143,9 @@ READERS = (
     Reader("a TrajectoryBuffer", lambda dataset: isinstance(dataset, TrajectoryBuffer), lambda dataset: dataset, None),
 )
 
+# Readers whose observation_keys may be a mapping.
+RENAMING = (load_lerobot, load_zarr, load_robomimic, load_several)
+
 
 def load_dataset(
     dataset: Dataset,
@@ -189,7 +192,7 @@ def load_dataset(
         refused, with a warning that names their number and the first reason; `observation_keys` and `clip_actions`;
         `filter_key` for robomimic files and `episodes` for LeRobot datasets, see also :func:`load_flat`
     :raises DatasetError: `dataset` is nothing of the above, its reader refuses it, or its cache cannot be used
-    :raises TypeError: the reader has no such option
+    :raises TypeError: the reader has no such option, or renames nothing
     """
     named = {"cache_dir": cache_dir, "env_id": env_id, "max_episode_steps": max_episode_steps, "min_return": min_return}
     named |= {"best_share": best_share, "success_only": success_only, "fraction": fraction, "fraction_seed": fraction_seed}
@@ -209,6 +212,11 @@ def load_dataset(
         of_one = f" Those of a single one: {{'dataset': ..., {unknown[0]!r}: ...}}." if is_several(dataset) else ""
         raise TypeError(
             f"dataset {name}: unknown option {with_nearest(unknown, accepted)}; accepted: {', '.join(accepted)}.{of_one}"
+        )
+    if isinstance(kwargs.get("observation_keys"), Mapping) and reader.load not in RENAMING:
+        raise TypeError(
+            "observation_keys: a mapping renames entries of LeRobot, robomimic and zarr datasets; give a list of names, and "
+            "rename the entries of other data themselves."
         )
     common: dict[str, Any] = {"action_space": action_space, "observation_space": observation_space, "env_id": env_id}
     common.update(env_args=env_args, max_episode_steps=max_episode_steps, allow_pickle=allow_pickle)

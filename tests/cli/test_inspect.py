@@ -6,6 +6,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from PIL import Image
 
 import sb3_dtfm
@@ -215,7 +216,9 @@ def test_a_task_of_another_package_is_found(workplace, capsys):
     assert main([*shlex.split(command)[1:], "-n", "2", "--eval-freq", "-1", "--verbose", "0"]) == 0
 
 
-def test_images_are_named_and_drawn(workplace, capsys):
+def test_images_are_named_and_drawn(workplace, capsys, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(Axes, "imshow", lambda self, image, **kwargs: drawn.append(image))
     rng = np.random.default_rng(0)
     frames = {"image:front": rng.integers(0, 256, (20, 40, 48, 3), np.uint8)}
     frames["image:hand"] = rng.integers(0, 256, (20, 1, 40, 40), np.uint8)
@@ -224,6 +227,9 @@ def test_images_are_named_and_drawn(workplace, capsys):
     text = capsys.readouterr().out
     assert "| images | front 40 x 48 x 3, hand 1 x 40 x 40 |" in text
     with_images = Image.open("dataset.png").size
+    front, hand = (frames[f"image:{camera}"][[0, 2, 4]] for camera in ("front", "hand"))
+    for image, expected in zip(drawn, [*front, *np.moveaxis(hand, 1, 3)], strict=True):  # upright, in colour
+        np.testing.assert_array_equal(image, expected)
     wanted = "['image:front']"
     assert main(["inspect", "pixels.npz", "--dataset-kwargs", "action_bounds:(-2, 2)", f"observation_keys:{wanted}"]) == 0
     text = capsys.readouterr().out

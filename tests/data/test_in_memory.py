@@ -18,7 +18,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dtfm import DT
-from sb3_dtfm.data import DatasetError, Trajectory, load_dataset
+from sb3_dtfm.data import DatasetError, Trajectory, in_memory, load_dataset
 from sb3_dtfm.envs import ReturnToGoWrapper
 from sb3_dtfm.envs.observation_spaces import sort_observation_space
 
@@ -425,9 +425,11 @@ def test_the_replay_buffer_of_an_sb3_model(goal, buffer_size):
     assert np.ptp(actions, axis=0).min() > 1.0  # of ranges 4 and 10: scaled ones would not have been
 
 
+@pytest.mark.parametrize("block", [1000, 4])
 @pytest.mark.parametrize("goal", [False, True])
-def test_a_second_learn_begins_another_episode(goal):
+def test_a_second_learn_begins_another_episode(goal, block, monkeypatch):
     """It resets the environment without a word to the buffer: the episode of that time is unfinished, and left out."""
+    monkeypatch.setattr(in_memory, "BLOCK", block)
     small = dict(learning_starts=100, buffer_size=50, policy_kwargs={"net_arch": [4]}, device="cpu", seed=0)
     env = make_vec_env(lambda: TimeLimit(Course(goal), 7))
     model = DDPG("MultiInputPolicy" if goal else "MlpPolicy", env, train_freq=(1, "step"), **small).learn(6).learn(9)
@@ -555,3 +557,9 @@ def test_arrays_of_single_numbers_in_a_list_are_no_steps():
     arrays = {"obs": np.zeros(60), "actions": np.zeros(60), "episode_ends": [20, 40, 60]}
     with pytest.warns(UserWarning, match="there is none of rewards"):
         assert load_dataset([arrays], action_space=spaces.Box(-1, 1, (1,))).n_episodes == 3
+
+
+def test_entries_of_lists_are_not_renamed():
+    episode = {"observations": {"top": np.zeros((3, 8, 8, 3), np.uint8)}, "actions": np.zeros((3, 1)), "rewards": np.ones(3)}
+    with pytest.raises(TypeError, match="a mapping renames entries of LeRobot, robomimic and zarr datasets; give a list of"):
+        load_dataset([episode], observation_keys={"pixels": "top"})
