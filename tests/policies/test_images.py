@@ -201,10 +201,11 @@ def test_a_critic_values_what_images_show(buffer):
     assert np.isfinite(model.policy.predict(observation, deterministic=True)[0]).all()
 
 
-def test_the_exported_file_acts_alike(buffer, tmp_path):
+@pytest.mark.parametrize("acting", [{}, dict(chunk_size=4, n_action_steps=2), dict(kv_cache=True)])
+def test_the_exported_file_acts_alike(buffer, acting, tmp_path):
     """By the example's loop, as a user would take it."""
     pytest.importorskip("onnxruntime")
-    model = make(DTFM, buffer).learn(2)
+    model = make(DTFM, buffer, policy_kwargs=acting).learn(2)
     model.export(tmp_path / "policy.onnx")
     policy = runpy.run_path(str(DEPLOY))["Policy"](str(tmp_path / "policy.onnx"))
     assert policy.settings["images"] == {CAMERA: [3, 32, 32]}
