@@ -157,7 +157,7 @@ def _by_reward(buffer: TrajectoryBuffer) -> list[Decision]:
 
 
 def _seen(buffer: TrajectoryBuffer) -> str:
-    """What predictions are made of."""
+    """Name the input of the predictions."""
     return "the vector beside the images" if buffer.image_spaces else "the observation"
 
 

@@ -53,7 +53,7 @@ class ResidualExtractor(BaseFeaturesExtractor):
         self.shift = shift
         n_channels, height, width = observation_space.shape
         self.size = (round(crop * height), round(crop * width))
-        # What the stem and the blocks but the last leave of each side.
+        # Sides of the last map: the stem and all blocks but the last stride.
         left = [-(-((side - 4) // 4 + 1) // 2 ** (len(channels) - 2)) for side in self.size]
         if min(left) < 1 or max(left) < 2:
             raise ValueError(

@@ -294,7 +294,7 @@ COMMANDS_WITH_PACKAGES = {
 }
 AGENT = [str(PPO_RUN / "Pendulum-v1.zip"), "-n", "8"]
 STILL_RUNS = {
-    "train -params": ["train", "--algo", "dtfm", "-params", f"a:{CODE}"],
+    "train -params": ["train", "--algo", "dtfm", *ENV, "-params", f"a:{CODE}"],
     "train --env-kwargs": ["train", "--algo", "ppo", *PENDULUM, "--env-kwargs", f"a:{CODE}"],
     "train --eval-env-kwargs": ["train", "--algo", "ppo", *PENDULUM, "--eval-env-kwargs", f"a:{CODE}"],
     "finetune -params": [*FINETUNE, "-params", f"a:{CODE}"],
