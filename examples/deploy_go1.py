@@ -40,6 +40,8 @@ STANDING_UP = 2.0  # seconds
 RAMP = 1.0  # seconds in which the command grows from and falls to zero
 LARGEST_COMMAND = np.array([1.5, 0.8, 1.2])  # forward and left in m/s, turn in rad/s; of training
 EPISODE_STEPS = 1000  # of training
+# Signals that end the program: also where its terminal is gone.
+ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
 class Measurement(NamedTuple):
@@ -140,6 +142,7 @@ class Guard:
             self._over.set()
         finally:  # where the robot has not taken it, the watchdog tries for a while
             self._watchdog.join(GIVING_UP)
+            self._over.set()
 
     def stop(self, reason: str) -> None:
         """Let the robot sink down, for good. The first reason stays."""
@@ -276,11 +279,13 @@ def ended_by_keyboard() -> Iterator[threading.Event]:
         signal.signal(signal.SIGINT, earlier)
 
 
-def check_command(command: np.ndarray) -> None:
+def check_walk(command: np.ndarray, seconds: float) -> None:
     """
-    :raises ValueError: a command beyond `LARGEST_COMMAND`
+    :raises ValueError: a command beyond `LARGEST_COMMAND`, or a time without an end
     """
-    if not (np.abs(command) <= LARGEST_COMMAND).all():
+    if not 0.0 <= seconds < np.inf:
+        raise ValueError(f"seconds is {seconds}; a number of them is expected, and Ctrl-C ends a long walk.")
+    if np.shape(command) != (3,) or not (np.abs(command) <= LARGEST_COMMAND).all():
         raise ValueError(
             f"command {command.tolist()} is beyond {LARGEST_COMMAND.tolist()}, which training asked for at most."
         )
@@ -288,7 +293,7 @@ def check_command(command: np.ndarray) -> None:
 
 def terminate(*_: Any) -> None:
     """Let the robot sink down, whatever signals follow."""
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in (*ENDING, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)
     sys.exit("Terminated; the robot sinks down.")
 
@@ -299,10 +304,10 @@ def run(robot: Robot, policy: Policy, command: np.ndarray, seconds: float, patie
 
     :param command: forward and left in m/s, turn in rad/s, (3,)
     :return: milliseconds of each decision
-    :raises ValueError: a command beyond `LARGEST_COMMAND`
+    :raises ValueError: a command beyond `LARGEST_COMMAND`, or a time without an end
     :raises StoppedError: by a limit or the watchdog
     """
-    check_command(command)
+    check_walk(command, seconds)
     policy.act(np.zeros(45, np.float32), 0.0, 0)  # the first call takes longer than the watchdog waits
     with ended_by_keyboard() as ended, Guard(robot, patience) as guard:
         move(guard, HOME, STANDING_UP, ended)
@@ -321,11 +326,12 @@ def main() -> None:
     options = parser.parse_args()
     command = np.array([options.forward, options.left, options.turn])
     try:
-        check_command(command)
+        check_walk(command, options.seconds)
     except ValueError as error:
         parser.error(str(error))
     robot: Any = SimulatedRobot(options.model_file)
-    signal.signal(signal.SIGTERM, terminate)
+    for number in ENDING:
+        signal.signal(number, terminate)
     try:
         milliseconds = run(robot, Policy(options.policy), command, options.seconds)
     except StoppedError as error:

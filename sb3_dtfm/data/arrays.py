@@ -212,6 +212,14 @@ class _InMemory(Arrays):
         return None
 
 
+def _unnested(entry: Any) -> np.ndarray:
+    """An entry of a table as an array of numbers; pandas reads nested lists as arrays of arrays."""
+    array = np.asarray(entry)
+    if array.dtype == object and array.ndim and isinstance(array.flat[0], np.ndarray | list):
+        return np.stack([_unnested(part) for part in array])
+    return array
+
+
 class _Table(Arrays):
     """A DataFrame's columns, whose entries are numbers, or arrays of one length."""
 
@@ -226,7 +234,7 @@ class _Table(Arrays):
         column = self._columns[name]
         first = next(iter(column), None)
         with contextlib.suppress(Exception):  # lists of different lengths
-            array = np.asarray(first)
+            array = _unnested(first)
             return ((len(column), *array.shape), array.dtype) if array.dtype != object else None
         return None
 
@@ -235,7 +243,7 @@ class _Table(Arrays):
         array = np.asarray(column.to_numpy() if hasattr(column, "to_numpy") else column)
         with wrap_dataset_errors(where, NUMBERS_EXPECTED):
             nested = array.dtype == object and array.size > 0 and np.ndim(np.asarray(array[0])) > 0
-            return np.stack([np.asarray(entry) for entry in array]) if nested else array
+            return np.stack([_unnested(entry) for entry in array]) if nested else array
 
 
 class _Parquet(Arrays):

@@ -4,6 +4,7 @@ import contextlib
 import itertools
 import math
 import os
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -180,9 +181,10 @@ def load_flat(
 
 def _entries(arrays: Arrays, space: spaces.Space | None, others: Collection[str]) -> list[str]:
     """Arrays of an environment's entries, sorted by the entry, if each has one of its name and its size."""
-    if arrays.are_columns and any(name.startswith(OBSERVATIONS) for name in arrays.names):  # a table's own
-        return []
     parts = space.spaces if isinstance(space, spaces.Dict) else {}
+    own = re.compile(rf"({'|'.join(OBSERVATIONS)})([\W_\d]|$)")  # columns of a table
+    if arrays.are_columns and any(own.match(name) for name in arrays.names if name not in parts):
+        return []
     others = {*others, *ACTIONS, *REWARDS, *SUCCESSES, *ENDS_OF_EPISODES}
     keys = []
     for entry, part in sorted(parts.items()):

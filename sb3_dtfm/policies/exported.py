@@ -143,8 +143,10 @@ class ExportedPolicy(nn.Module):
             inputs["keys_values"] = draw(n_rows, trunk.n_layers, 2, n_kept, trunk.embed_dim)
         if self.network.encoder is not None:
             inputs["features"] = draw(*shape, self.network.encoder.features_dim)
-            if taken := sorted(inputs.keys() & self.settings["images"]):
-                raise ValueError(f"export: an image is called {', '.join(taken)}, as an input of the file; rename it.")
+            if taken := sorted({*inputs, *self.outputs} & set(self.settings["images"])):
+                raise ValueError(
+                    f"export: an image is called {', '.join(taken)}, which the file calls something else; rename it."
+                )
             inputs["images"] = {
                 camera: th.randint(0, 256, (n_rows, *size), dtype=th.uint8, generator=generator)
                 for camera, size in self.settings["images"].items()

@@ -130,9 +130,11 @@ def test_images_in_a_column_are_told_of_and_read_if_they_are_named(kind, tmp_pat
         table = pandas.DataFrame({**columns, "pixels": list(images)})
     with pytest.warns(UserWarning, match=r"pixels has an image of shape \(8, 9, 3\) for each step, and is not read"):
         assert load_dataset(table).image_spaces == {}
-    buffer = load_dataset(table, observation_keys=["obs_0", "pixels"])
-    np.testing.assert_array_equal(buffer.own("pixels").numpy(), images)
-    assert buffer.observations[:, 0].tolist() == [0.0, 1.0, 2.0, 3.0]
+    tables = [table, pandas.read_parquet(table)] if kind == "parquet" else [table]
+    for each in tables:
+        buffer = load_dataset(each, observation_keys=["obs_0", "pixels"])
+        np.testing.assert_array_equal(buffer.own("pixels").numpy(), images)
+        assert buffer.observations[:, 0].tolist() == [0.0, 1.0, 2.0, 3.0]
 
 
 @pytest.mark.parametrize("first", [[], None])
@@ -144,10 +146,14 @@ def test_a_column_of_lists_that_nobody_needs_may_hold_anything(first, tmp_path):
     np.testing.assert_allclose(buffer.actions[0].numpy(), [0.5, 0.1, 0.2, 0.3])
 
 
-def test_tensors_of_arrow_keep_their_shape(tmp_path):
+@pytest.mark.parametrize("is_contiguous", [True, False])
+def test_tensors_of_arrow_keep_their_shape(is_contiguous, tmp_path):
     images = np.random.default_rng(0).integers(0, 256, (2, 8, 9, 3), dtype=np.uint8)
     columns = {"obs_0": pa.array([0.0, 1.0]), "action": pa.array([0.5, 0.1]), "reward": pa.array([1.0, 1.0])}
-    tensors = pa.FixedShapeTensorArray.from_numpy_ndarray(images)
+    tensors = pa.FixedShapeTensorArray.from_numpy_ndarray(images if is_contiguous else images.transpose(0, 3, 1, 2).copy())
+    if not is_contiguous:  # (8, 9, 3) that lie in memory as (3, 8, 9)
+        kind = pa.fixed_shape_tensor(pa.uint8(), (3, 8, 9), permutation=(1, 2, 0))
+        tensors = pa.ExtensionArray.from_storage(kind, tensors.storage)
     pq.write_table(pa.table({**columns, "done": pa.array([0, 1]), "pixels": tensors}), tmp_path / "steps.parquet")
     buffer = load_dataset(tmp_path / "steps.parquet", observation_keys=["obs_0", "pixels"])
     np.testing.assert_array_equal(buffer.own("pixels").numpy(), images)
@@ -170,3 +176,7 @@ def test_columns_of_an_environments_entries_are_read_where_there_are_none_that_b
     np.testing.assert_array_equal(named.observations.numpy(), [[2.0, 0.0], [3.0, 1.0]])
     own = load_dataset(pandas.DataFrame({**columns, "obs_0": [7.0, 8.0]}), observation_space=space)
     assert own.observations.tolist() == [[7.0], [8.0]]
+    goals = pandas.DataFrame({**columns, "observation": [4.0, 5.0], "obstacles": [6.0, 7.0]})
+    parts = dict.fromkeys(("a", "b", "observation", "obstacles"), spaces.Box(-9, 9, (1,)))
+    entries = load_dataset(goals, observation_space=spaces.Dict(parts))
+    assert entries.observations.tolist() == [[2.0, 0.0, 4.0, 6.0], [3.0, 1.0, 5.0, 7.0]]

@@ -175,13 +175,14 @@ def test_the_keyboard_lets_a_robot_lie_down_while_it_stands_up_or_walks(deploy, 
 
 def test_a_terminated_process_lets_the_robot_sink_down(deploy, robot):
     recorded = Recorded(robot)
-    before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)]
+    numbers = (*deploy.ENDING, signal.SIGINT)
+    before = [signal.getsignal(number) for number in numbers]
     try:
         signal.signal(signal.SIGTERM, deploy.terminate)
         with pytest.raises(SystemExit, match="sinks down"), deploy.Guard(recorded, 30.0):
             signal.raise_signal(signal.SIGTERM)
     finally:
-        for number, handler in zip((signal.SIGTERM, signal.SIGINT), before, strict=True):
+        for number, handler in zip(numbers, before, strict=True):
             signal.signal(number, handler)
     assert recorded.commands[-1][1:] == (0.0, deploy.DAMPING)
 
@@ -191,6 +192,9 @@ def test_a_command_beyond_that_of_training_is_refused_before_anything_moves(depl
     for wrong in ([100.0, 0.0, 0.0], [0.0, np.nan, 0.0]):
         with pytest.raises(ValueError, match=r"is beyond \[1.5, 0.8, 1.2\]"):
             deploy.run(recorded, deploy.Policy(str(policy_file)), np.array(wrong), 1.0)
+    for seconds in (np.inf, np.nan):
+        with pytest.raises(ValueError, match=f"seconds is {seconds}; a number of them is expected"):
+            deploy.run(recorded, deploy.Policy(str(policy_file)), np.zeros(3), seconds)
     assert not recorded.commands
 
 
@@ -289,6 +293,8 @@ def test_the_watchdog_goes_on_where_the_end_does_not_reach_the_robot(deploy, rob
     with pytest.raises(OSError, match="no connection"), deploy.Guard(recorded, 0.05) as guard:
         guard.send(deploy.HOME, robot.read())
     assert recorded.commands[-1][1:] == (0.0, deploy.DAMPING)
+    guard._watchdog.join(30.0)
+    assert not guard._watchdog.is_alive(), "another guard may follow"
 
 
 def test_the_watchdog_stops_the_robot_while_a_command_hangs(deploy, robot):

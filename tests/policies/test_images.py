@@ -224,11 +224,14 @@ def test_the_exported_file_acts_alike(buffer, acting, tmp_path):
         start = np.array([False])
 
 
-def test_an_image_with_the_name_of_an_input_is_refused_by_the_export(episodes, tmp_path):
+@pytest.mark.parametrize("name", ["mask", "chunk"])
+def test_an_image_with_the_name_of_an_input_or_output_is_refused_by_the_export(name, episodes, tmp_path):
     pytest.importorskip("onnxruntime")
-    named = [({"mask": seen[CAMERA], "state": seen["state"]}, *rest) for seen, *rest in episodes[0]]
+    named = [({name: seen[CAMERA], "state": seen["state"]}, *rest) for seen, *rest in episodes[0]]
     model = make(DT, load_dataset([named], **BOUNDS)).learn(1)
-    with pytest.raises(ValueError, match="export: an image is called mask, as an input of the file; rename it"):
+    with pytest.raises(
+        ValueError, match=f"export: an image is called {name}, which the file calls something else; rename it"
+    ):
         model.export(tmp_path / "policy.onnx")
     assert not (tmp_path / "policy.onnx").exists()
 
