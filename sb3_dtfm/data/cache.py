@@ -25,7 +25,7 @@ from sb3_dtfm.data.storage import STEP_ARRAYS, WRITE_BUFFER, FileStorage, Mapped
 from sb3_dtfm.data.trajectories import DatasetError, ScoreReference
 
 # Counts up whenever what is stored, or what the readers make of a dataset, changes: older caches are then built anew.
-FORMAT = 11
+FORMAT = 12
 DESCRIPTION = "cache.json"
 EPISODES = "episodes.npz"
 SPACES = ("observation_space", "action_space")
