@@ -16,8 +16,7 @@ TIMESTEP = "timestep"
 IMAGE = "image"
 # Numbers of channels that images have.
 CHANNELS = (1, 3, 4)
-# Sides of what may be an image of several channels, pixels, and of a matrix that may be one.
-SMALLEST_IMAGE = 4
+# Sides from which on a matrix may be a picture, pixels.
 SMALLEST_PICTURE = 16
 # Names of what ReturnToGoWrapper shows and of a step's arrays, which no image may have.
 RESERVED = {OBSERVATION, RETURN_TO_GO, TIMESTEP, "observations", "actions", "rewards", "returns_to_go"}
@@ -58,9 +57,9 @@ def looks_like_images(shape: tuple[int, ...]) -> bool:
     """
     if len(shape) < 3:
         return False
-    *_, first, second, third = shape
-    last, leading = third in CHANNELS and min(first, second), first in CHANNELS and min(second, third)
-    return max(last, leading) >= SMALLEST_IMAGE
+    *several, first, second, third = shape
+    smallest = SMALLEST_PICTURE if several else 0
+    return (third in CHANNELS and min(first, second) >= smallest) or (first in CHANNELS and min(second, third) >= smallest)
 
 
 def warn_if_a_picture(shape: tuple[int, ...]) -> None:

@@ -68,6 +68,11 @@ class Arrays(ABC):
         cure = " Name the columns with observation_keys=[...] and action_keys=[...]." if self.are_columns else ""
         raise DatasetError(f"{self.source}: has no array {accepted}, only {found}.{cure}")
 
+    def beginning(self, name: str) -> list[str]:
+        """The columns of a table that begin with a name, but the next step's."""
+        following = rf"{name}[\W_]+next([\W_]|$)"
+        return [each for each in self.names if re.match(rf"{name}[\W_\d]", each) and not re.match(following, each)]
+
     def columns(self, names: Sequence[str]) -> list[str]:
         """
         The columns of a table that begin with the first of the names that any begins with, as `obs.x` and `obs.y`, but the
@@ -75,8 +80,7 @@ class Arrays(ABC):
         """
         if self.are_columns and not self.has(names):
             for name in names:
-                following = rf"{name}[\W_]+next([\W_]|$)"
-                found = [each for each in self.names if re.match(rf"{name}[\W_\d]", each) and not re.match(following, each)]
+                found = self.beginning(name)
                 numbered = [each for each in found if re.fullmatch(rf"{name}[\W_\d]*\d[\W_]*", each)]
                 if unread := sorted(set(found) - set(numbered or found)):
                     warn(
@@ -259,10 +263,14 @@ class _Parquet(Arrays):
         self._file = file
 
     def describe(self, name: str) -> tuple[tuple[int, ...], np.dtype] | None:
+        n_rows, pyarrow = self._file.metadata.num_rows, import_pyarrow(self.source)
         with contextlib.suppress(Exception):  # no rows, lists of different lengths, or no numbers
+            kind = self._file.schema_arrow.field(name).type
+            if not pyarrow.types.is_nested(getattr(kind, "storage_type", kind)):
+                return (n_rows,), np.dtype(kind.to_pandas_dtype())
             for row in self._file.iter_batches(batch_size=1, columns=[name]):
                 found = as_numbers(row.column(0), name)
-                return (self._file.metadata.num_rows, *found.shape[1:]), found.dtype
+                return (n_rows, *found.shape[1:]), found.dtype
         return None
 
     def _get(self, name: str, where: str) -> Any:

@@ -38,7 +38,7 @@ def as_numbers(values: Any, where: str) -> np.ndarray:
     if not n_rows:
         raise DatasetError(f"{where} has no rows; a row for each step is expected.")
     pyarrow = import_pyarrow(where)
-    tensor = values.type if None not in (getattr(values.type, "shape", None) or [None]) else None
+    kind = values.type
     if isinstance(values, pyarrow.ExtensionArray):
         values = values.storage
     axes = []
@@ -50,7 +50,7 @@ def as_numbers(values: Any, where: str) -> np.ndarray:
         values = values.flatten()
     array = values.to_numpy(zero_copy_only=False)
     check_real(array.dtype, where)
-    if tensor is None:
+    if not isinstance(kind, pyarrow.FixedShapeTensorType):
         return array.reshape(n_rows, *axes)
-    order = getattr(tensor, "permutation", None) or range(len(tensor.shape))
-    return array.reshape(n_rows, *tensor.shape).transpose(0, *(1 + axis for axis in order))
+    order = kind.permutation or range(len(kind.shape))
+    return array.reshape(n_rows, *kind.shape).transpose(0, *(1 + axis for axis in order))

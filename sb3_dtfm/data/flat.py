@@ -4,7 +4,6 @@ import contextlib
 import itertools
 import math
 import os
-import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -182,9 +181,10 @@ def load_flat(
 def _entries(arrays: Arrays, space: spaces.Space | None, others: Collection[str]) -> list[str]:
     """Arrays of an environment's entries, sorted by the entry, if each has one of its name and its size."""
     parts = space.spaces if isinstance(space, spaces.Dict) else {}
-    own = re.compile(rf"({'|'.join(OBSERVATIONS)})([\W_\d]|$)")  # columns of a table
-    if arrays.are_columns and any(own.match(name) for name in arrays.names if name not in parts):
-        return []
+    if arrays.are_columns:
+        own = {*OBSERVATIONS, *itertools.chain(*map(arrays.beginning, OBSERVATIONS))} & set(arrays.names)
+        if own - set(parts):  # a table's own observation
+            return []
     others = {*others, *ACTIONS, *REWARDS, *SUCCESSES, *ENDS_OF_EPISODES}
     keys = []
     for entry, part in sorted(parts.items()):

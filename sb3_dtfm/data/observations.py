@@ -55,7 +55,12 @@ def observed(observations: Any, keys: Sequence[str] | None, space: spaces.Space 
     :return: without vectors a single number that is always 0
     :raises DatasetError: as :func:`in_space` and :func:`chosen`
     """
-    entries = observations if isinstance(observations, Mapping) else {IMAGE: observations}
+    if isinstance(observations, Mapping):
+        entries = {name: _array(each, f"{where}, {name}") for name, each in observations.items()}
+        observations = entries
+    else:
+        observations = _array(observations, where)
+        entries = {IMAGE: observations}
     names = list(entries) if keys is None else keys
     images = {str(name): np.asarray(entries[name]) for name in names if name in entries and is_images(entries[name])}
     if not images:
@@ -68,6 +73,30 @@ def observed(observations: Any, keys: Sequence[str] | None, space: spaces.Space 
     if keys is None:
         return Observed(in_space({name: entries[name] for name in others}, space, where), images)
     return Observed(chosen(entries, others, space, where), images)
+
+
+def _array(entry: Any, where: str) -> Any:
+    """An array of what is a list of arrays; anything else as it is."""
+    is_list = isinstance(entry, list | tuple) and len(entry) > 0 and isinstance(entry[0], np.ndarray)
+    return stacked(entry, where) if is_list else entry
+
+
+def stacked(steps: Sequence[Any], where: str) -> np.ndarray:
+    """
+    One array after the other.
+
+    :param steps: an array of each step
+    :param where: whose they are, for messages
+    :return: (T, ...)
+    :raises DatasetError: a step has another shape than the first
+    """
+    arrays = [np.asarray(step) for step in steps]
+    other = next((number for number, array in enumerate(arrays) if array.shape != arrays[0].shape), None)
+    if other is not None:
+        raise DatasetError(
+            f"{where}: step {other} has the shape {arrays[other].shape}, expected {arrays[0].shape} as in step 0."
+        )
+    return np.stack(arrays)
 
 
 def is_images(array: Any) -> bool:

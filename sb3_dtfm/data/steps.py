@@ -8,6 +8,7 @@ import numpy as np
 
 from sb3_dtfm.data.ends import DONES, TERMINATIONS, TRUNCATIONS
 from sb3_dtfm.data.flat import ACTIONS, OBSERVATIONS, REWARDS, holds_episodes
+from sb3_dtfm.data.observations import stacked
 from sb3_dtfm.data.trajectories import DatasetError
 from sb3_dtfm.envs.success import reported_success
 
@@ -145,10 +146,4 @@ def _stacked(observations: Sequence[Any], where: str) -> Any:
     if isinstance(first, tuple) and any(isinstance(part, Mapping | tuple) or np.ndim(part) for part in first):
         parts = zip(*observations, strict=True)
         return {place: _stacked(part, f"{where}, {place}") for place, part in enumerate(parts)}
-    arrays = [np.asarray(observation) for observation in observations]
-    other = next((number for number, array in enumerate(arrays) if array.shape != arrays[0].shape), None)
-    if other is not None:
-        raise DatasetError(
-            f"{where}: step {other} has the shape {arrays[other].shape}, expected {arrays[0].shape} as in step 0."
-        )
-    return np.stack(arrays)
+    return stacked(observations, where)

@@ -253,8 +253,9 @@ def test_a_target_that_is_not_finite_is_never_sent(deploy, robot, policy_file, w
 
 def test_the_watchdog_stops_the_robot_while_a_policy_still_thinks(deploy, robot):
     recorded = Recorded(robot)
-    with deploy.Guard(recorded, 0.1) as guard:
+    with deploy.Guard(recorded, 30.0) as guard:
         guard.send(deploy.HOME, robot.read())
+        guard.patience = 0.1  # from now on, so that a slow start is none of the policy
         time.sleep(0.4)
         during = list(recorded.commands)
         with pytest.raises(deploy.StoppedError, match="no command came for more than 100 ms"):
@@ -274,8 +275,9 @@ def test_the_watchdog_tries_again_until_the_robot_takes_its_command(deploy, robo
         recorded.commands.append((targets, kp, kd))
 
     recorded.command = command
-    with deploy.Guard(recorded, 0.05) as guard:
+    with deploy.Guard(recorded, 30.0) as guard:
         guard.send(deploy.HOME, robot.read())
+        guard.patience = 0.05
         wait_until(lambda: len(recorded.commands) >= 2)
     assert not failures
     assert recorded.commands[1][1:] == (0.0, deploy.DAMPING)
@@ -290,18 +292,26 @@ def test_the_watchdog_goes_on_where_the_end_does_not_reach_the_robot(deploy, rob
         recorded.commands.append((targets, kp, kd))
 
     recorded.command = command
-    with pytest.raises(OSError, match="no connection"), deploy.Guard(recorded, 0.05) as guard:
-        guard.send(deploy.HOME, robot.read())
+    guard = deploy.Guard(recorded, 30.0)
+
+    def walk_and_leave():
+        with guard:
+            guard.send(deploy.HOME, robot.read())
+            guard.patience = 0.05
+
+    with pytest.raises(OSError, match="no connection"):
+        walk_and_leave()
     assert recorded.commands[-1][1:] == (0.0, deploy.DAMPING)
     guard._watchdog.join(30.0)
     assert not guard._watchdog.is_alive(), "another guard may follow"
 
 
 def test_the_watchdog_stops_the_robot_while_a_command_hangs(deploy, robot):
-    recorded, is_released = Recorded(robot), threading.Event()
+    recorded, is_hanging, is_released = Recorded(robot), threading.Event(), threading.Event()
 
     def command(targets, kp, kd):
         if kp > 0.0:
+            is_hanging.set()
             is_released.wait(30.0)
         recorded.commands.append((targets, kp, kd))
 
@@ -310,9 +320,11 @@ def test_the_watchdog_stops_the_robot_while_a_command_hangs(deploy, robot):
             guard.send(deploy.HOME, robot.read())
 
     recorded.command = command
-    with deploy.Guard(recorded, 0.05) as guard:
+    with deploy.Guard(recorded, 30.0) as guard:
         hanging = threading.Thread(target=send, args=[guard])
         hanging.start()
+        wait_until(is_hanging.is_set)
+        guard.patience = 0.05
         wait_until(lambda: len(recorded.commands) >= 1)
         is_released.set()
         hanging.join()

@@ -361,6 +361,12 @@ def test_unfit_images_are_refused(episodes, buffer):
         DatasetError, match=r"pixels: step 7 has the shape \(16, 32, 3\), expected \(32, 32, 3\) as in step 0"
     ):
         load_dataset([mixed], **BOUNDS)
+    arrays = {name: [np.asarray(seen[name]) for seen, *_ in mixed] for name in mixed[0][0]}
+    others = {"actions": [action for _, action, *_ in mixed], "rewards": np.zeros(20)}
+    with pytest.raises(
+        DatasetError, match=r"pixels: step 7 has the shape \(16, 32, 3\), expected \(32, 32, 3\) as in step 0"
+    ):
+        load_dataset([{"observations": arrays, **others}], **BOUNDS)
     nested = [({"cameras": {CAMERA: seen[CAMERA]}, "state": seen["state"]}, *rest) for seen, *rest in episodes[0]]
     with pytest.raises(DatasetError, match=r"cameras, pixels holds images of shape \(32, 32, 3\) inside of another entry"):
         load_dataset([nested], **BOUNDS)
