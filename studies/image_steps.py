@@ -19,7 +19,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from sb3_dtfm import DTFM
 
 CAMERAS, SIDE, BATCH_SIZE = ("agentview", "robot0_eye_in_hand"), 84, 64
-EXTRACTORS = ("ResidualExtractor", "NatureCNN")
+EXTRACTORS = ("ResidualExtractor", "NatureCNN", "ResNet18")
 NAMES = ("mm", "addmm", "bmm", "baddbmm", "convolution", "convolution_backward")
 PRODUCTS = [getattr(th.ops.aten, name).default for name in NAMES]
 
@@ -90,12 +90,13 @@ def main() -> None:
     """See the top."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=20)
-    n_steps = parser.parse_args().steps
+    parser.add_argument("--extractors", nargs="+", choices=EXTRACTORS, default=EXTRACTORS, help="ResNet18 needs torchvision")
+    options = parser.parse_args()
     print("| encoder | precision | products, ms | step, ms | step / products | images a second | action, ms at most |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
-    for extractor in EXTRACTORS:
+    for extractor in options.extractors:
         for precision in ("float32", "bfloat16"):
-            step, alone, act = measure(extractor, precision, n_steps)
+            step, alone, act = measure(extractor, precision, options.steps)
             times = f"{1e3 * alone:.0f} | {1e3 * step:.0f} | {step / alone:.2f}"
             rate = len(CAMERAS) * BATCH_SIZE / step
             print(f"| {extractor} | {precision} | {times} | {rate:,.0f} | {1e3 * act:.1f} |", flush=True)

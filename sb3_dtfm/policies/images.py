@@ -12,10 +12,10 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Combine
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_dtfm.policies.resnet import ResNet18
+from sb3_dtfm.policies.resnet import GroupNorm, ResNet18
 
 # Channels in each group of a group normalisation.
-GROUP = 8
+CHANNELS_PER_GROUP = 8
 # Random crops in a batch on a CPU: slices, since indices for each image take as long as a convolution.
 N_CROPS = 16
 
@@ -101,10 +101,10 @@ class ResidualBlock(nn.Module):
     def __init__(self, n_in: int, n_out: int, stride: int) -> None:
         super().__init__()
         self.first = nn.Conv2d(n_in, n_out, kernel_size=3, stride=stride, padding=1, bias=False)
-        n_groups = max(1, n_out // GROUP)
-        self.first_norm = nn.GroupNorm(n_groups, n_out)
+        n_groups = max(1, n_out // CHANNELS_PER_GROUP)
+        self.first_norm = GroupNorm(n_groups, n_out)
         self.second = nn.Conv2d(n_out, n_out, kernel_size=3, padding=1, bias=False)
-        self.second_norm = nn.GroupNorm(n_groups, n_out)
+        self.second_norm = GroupNorm(n_groups, n_out)
         same = n_in == n_out and stride == 1
         self.shortcut = nn.Identity() if same else nn.Conv2d(n_in, n_out, kernel_size=1, stride=stride, bias=False)
 
@@ -118,12 +118,15 @@ def spatial_softmax(maps: th.Tensor) -> th.Tensor:
     """
     Return where each channel is largest: the mean position under its softmax.
 
+    Channels stay last, as a CPU's convolutions leave them: another order costs a copy of each map, and of all gradients.
+
     :param maps: (N, C, height, width)
     :return: (N, 2 C) in [-1, 1], the rows of all channels, then the columns
     """
-    weights = maps.flatten(2).softmax(dim=-1).view_as(maps)
-    rows, columns = (th.linspace(-1.0, 1.0, n, device=maps.device) for n in maps.shape[2:])
-    return th.cat(((weights.sum(dim=3) * rows).sum(dim=2), (weights.sum(dim=2) * columns).sum(dim=2)), dim=1)
+    height, width = maps.shape[2:]
+    weights = maps.permute(0, 2, 3, 1).flatten(1, 2).softmax(dim=1).unflatten(1, (height, width))
+    rows, columns = (th.linspace(-1.0, 1.0, n, device=maps.device)[:, None] for n in (height, width))
+    return th.cat(((weights.sum(dim=2) * rows).sum(dim=1), (weights.sum(dim=1) * columns).sum(dim=1)), dim=1)
 
 
 # By the name that `features_extractor_class` and saved models have; a user's own class is entered here before loading.

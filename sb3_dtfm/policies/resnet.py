@@ -10,9 +10,20 @@ from torch import nn
 # Mean and standard deviation of ImageNet's channels, by which the weights that torchvision publishes expect them.
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 # Channels in each group of a group normalisation.
-GROUP = 16
+CHANNELS_PER_GROUP = 16
 # Buffers of batch normalisation.
 STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
+
+
+class GroupNorm(nn.GroupNorm):
+    """
+    Group normalisation (Wu and He, 2018) in float32: where channels lie last in memory, PyTorch's takes three to four times
+    as long in bfloat16 on a CPU.
+    """
+
+    def forward(self, maps: th.Tensor) -> th.Tensor:
+        """Map (N, channels, height, width) to the same shape and precision."""
+        return super().forward(maps.float()).to(maps.dtype)
 
 
 class ResNet18(BaseFeaturesExtractor):
@@ -41,7 +52,7 @@ class ResNet18(BaseFeaturesExtractor):
             raise ImportError("ResNet18 needs torchvision: pip install torchvision") from error
         if observation_space.shape[0] != 3:
             raise ValueError(f"ResNet18 needs images of 3 channels, got {observation_space.shape[0]}.")
-        self.network = resnet18(norm_layer=lambda n_channels: nn.GroupNorm(n_channels // GROUP, n_channels))
+        self.network = resnet18(norm_layer=lambda n_channels: GroupNorm(n_channels // CHANNELS_PER_GROUP, n_channels))
         if weights is not None:
             self._load(weights)
         self.network.fc = nn.Linear(self.network.fc.in_features, features_dim)

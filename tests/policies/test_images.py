@@ -16,6 +16,7 @@ from sb3_dtfm import DT, DTFM
 from sb3_dtfm.data import DatasetError, load_dataset
 from sb3_dtfm.envs import ReturnToGoWrapper
 from sb3_dtfm.policies.images import EXTRACTORS, N_CROPS, ImageEncoder, ResidualExtractor, spatial_softmax
+from sb3_dtfm.policies.resnet import GroupNorm
 from tests.algorithms.small import make_model
 from tests.images import CAMERA, make_pixels, record
 
@@ -267,6 +268,23 @@ def test_spatial_softmax_finds_the_place():
     maps = th.zeros(1, 2, 5, 9)
     maps[0, 0, 0, 8] = maps[0, 1, 2, 4] = 100.0
     th.testing.assert_close(spatial_softmax(maps), th.tensor([[-1.0, 0.0, 1.0, 0.0]]))
+
+
+@pytest.mark.parametrize("layout", [th.contiguous_format, th.channels_last])
+def test_spatial_softmax_is_the_mean_position(layout):
+    maps = th.randn(2, 3, 4, 5, generator=th.Generator().manual_seed(0)).contiguous(memory_format=layout)
+    weights = maps.reshape(2, 3, 20).softmax(dim=2).view(2, 3, 4, 5)
+    rows, columns = th.meshgrid(th.linspace(-1, 1, 4), th.linspace(-1, 1, 5), indexing="ij")
+    expected = [(weights * place).sum(dim=(2, 3)) for place in (rows, columns)]
+    th.testing.assert_close(spatial_softmax(maps), th.cat(expected, dim=1))
+
+
+def test_group_normalisation_is_computed_in_float32():
+    norm, maps = GroupNorm(2, 4), th.randn(3, 4, 5, 5, generator=th.Generator().manual_seed(0))
+    low = maps.bfloat16().contiguous(memory_format=th.channels_last)
+    for given in (low, maps):
+        expected = th.nn.functional.group_norm(given.float(), 2, norm.weight, norm.bias).to(given.dtype)
+        th.testing.assert_close(norm(given), expected, rtol=0, atol=0)
 
 
 def encoder(class_name, shapes, kwargs=None, normalize_images=True, shared=False):
