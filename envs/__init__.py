@@ -23,7 +23,7 @@ if TYPE_CHECKING:
         ReturnToGoWrapper,
         check_vec_env,
         known_task,
-        recorded_space,
+        reader_options,
         share_target_return,
     )
 
@@ -43,7 +43,7 @@ __all__ = [
     "flatten_observation_space",
     "image_spaces",
     "known_task",
-    "recorded_space",
+    "reader_options",
     "register_go1_env",
     "register_gymnasium_robotics",
     "register_robosuite_envs",

@@ -127,9 +127,14 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return found if isinstance(found, dict) else None
 
     @property
-    def recorded_space(self) -> spaces.Space:
-        """The environment's own observation space, with sorted keys."""
-        return self.env.observation_space if self._cameras else self._vector_space
+    def reader_options(self) -> dict[str, Any]:
+        """
+        Arguments of `load_dataset` that the environment decides: its own observation space with sorted keys, `env_args`,
+        and, if it has a Gymnasium id, the time limit.
+        """
+        task, space = self.known_task, self.env.observation_space if self._cameras else self._vector_space
+        limit = {} if task is None else {"max_episode_steps": task.max_episode_steps}
+        return {"observation_space": space, "env_args": self.env_args, **limit}
 
     def set_target_return(self, target_return: float) -> None:
         """
@@ -282,10 +287,10 @@ def known_task(env: VecEnv) -> Task | None:
     return task
 
 
-def recorded_space(env: VecEnv) -> spaces.Space:
-    """Observation space of the environment behind a :class:`ReturnToGoWrapper`, as its observations are recorded."""
-    (space,) = env.get_attr("recorded_space", indices=0)
-    return space
+def reader_options(env: VecEnv) -> dict[str, Any]:
+    """Arguments of `load_dataset` that the environment behind a :class:`ReturnToGoWrapper` decides."""
+    (options,) = env.get_attr("reader_options", indices=0)
+    return {"action_space": env.action_space, **options}
 
 
 def share_target_return(env: VecEnv, target_return: float | None) -> float | None:

@@ -27,7 +27,7 @@ from sb3_dtfm.benchmark.results import read_results
 from sb3_dtfm.benchmark.rows import BASELINES, Row, write_row
 from sb3_dtfm.cli.benchmark import parse_arguments
 from sb3_dtfm.data import TrajectoryBuffer, load_dataset
-from sb3_dtfm.envs import known_task, recorded_space
+from sb3_dtfm.envs import reader_options
 from sb3_dtfm.files import replacing
 
 IMPORTED = time.process_time()
@@ -83,10 +83,9 @@ class Training:
 
     def buffer(self) -> TrajectoryBuffer:
         """The episodes, as `train` reads them."""
-        settings, task = self.job.settings, known_task(self.vec_env)
-        known = {"action_space": self.vec_env.action_space, "observation_space": recorded_space(self.vec_env)}
-        known["max_episode_steps"] = task and task.max_episode_steps
-        return load_dataset(settings["dataset"], **{**known, **(settings.get("dataset_kwargs") or {})})
+        settings = self.job.settings
+        given = settings.get("dataset_kwargs") or {}
+        return load_dataset(settings["dataset"], **{**reader_options(self.vec_env), **given})
 
     def evaluate(self, model: Any, step: int, seconds: float, **more: Any) -> bool:
         """

@@ -26,7 +26,7 @@ from sb3_dtfm.distributed import (
     local_rank_zero_first,
     n_processes,
 )
-from sb3_dtfm.envs import channels_first, check_vec_env, known_task, recorded_space, return_to_go_space, share_target_return
+from sb3_dtfm.envs import channels_first, check_vec_env, reader_options, return_to_go_space, share_target_return
 from sb3_dtfm.optimization import (
     BATCHES,
     DROPOUT,
@@ -185,11 +185,10 @@ class OfflineAlgorithm(SequenceModel):
                 f"{name} has no dataset to learn from: give one to the constructor, or to a loaded model by "
                 f"{name}.load(path, dataset=...) or model.set_dataset(...)."
             )
-        if self.env is not None and (task := known_task(self.env)) is not None:
-            self.time_limit = task.max_episode_steps
         known: dict[str, Any] = {"action_space": getattr(self, "action_space", None), "max_episode_steps": self.time_limit}
         if self.env is not None:
-            known.update(observation_space=recorded_space(self.env), env_args=self.env.get_attr("env_args", [0])[0])
+            known |= reader_options(self.env)
+            self.time_limit = known["max_episode_steps"]
         with local_rank_zero_first():
             buffer = load_dataset(self.dataset, **{**known, **without_pickles(self.dataset_kwargs)})
         images = {camera: channels_first(space) for camera, space in buffer.image_spaces.items()}

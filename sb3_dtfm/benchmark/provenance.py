@@ -102,8 +102,7 @@ def read_for(env: gym.Env, dataset: Any, **options: Any) -> TrajectoryBuffer:
     :raises DatasetError: it cannot be read, or was recorded on another task; versions may differ
     """
     task = env.get_wrapper_attr("known_task")
-    known = {"observation_space": env.get_wrapper_attr("recorded_space"), "action_space": env.action_space}
-    known |= {"max_episode_steps": task and task.max_episode_steps, "env_args": env.get_wrapper_attr("env_args")}
+    known = {"action_space": env.action_space, **env.get_wrapper_attr("reader_options")}
     buffer = load_dataset(dataset, **{**known, **options})
     if task is not None:
         buffer.check_task(task.env_id)

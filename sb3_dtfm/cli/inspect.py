@@ -1,6 +1,7 @@
 """`sb3-dtfm inspect`: what is in a dataset, as a table and a picture, and a command to begin with."""
 
 import argparse
+import contextlib
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,11 +14,18 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_dtfm.actions import ActionSpace, same_actions
+from sb3_dtfm.benchmark.provenance import read_for
 from sb3_dtfm.cli.literals import key_value
 from sb3_dtfm.data import DatasetError, TrajectoryBuffer, check_action_space, load_dataset
 from sb3_dtfm.data.decisions import decide, sentences
 from sb3_dtfm.data.inspection import Inspection, Range, inspect_buffer
-from sb3_dtfm.envs import flatten_observation_space, image_spaces, register_gymnasium_robotics, without_images
+from sb3_dtfm.envs import (
+    ReturnToGoWrapper,
+    flatten_observation_space,
+    image_spaces,
+    register_gymnasium_robotics,
+    without_images,
+)
 from sb3_dtfm.envs.packages import import_packages
 from sb3_dtfm.files import printable
 
@@ -88,14 +96,9 @@ def load(
 def _load_for(
     env_id: str, env_kwargs: Mapping[str, Any], dataset: str | list[str], options: dict[str, Any]
 ) -> TrajectoryBuffer:
-    env = gym.make(env_id, **env_kwargs)
-    observed, action_space = env.observation_space, env.action_space
-    known: dict[str, Any] = {"action_space": action_space, "observation_space": observed}
-    known["max_episode_steps"] = None if env.spec is None else env.spec.max_episode_steps
-    known["env_args"] = getattr(env.unwrapped, "env_args", None)
-    env.close()
-    buffer = load_dataset(dataset, **{**known, **options})
-    buffer.check_task(env_id)
+    with contextlib.closing(ReturnToGoWrapper(gym.make(env_id, **env_kwargs))) as env:
+        observed, action_space = env.env.observation_space, env.action_space
+        buffer = read_for(env, dataset, **options)
     flat, cameras = flatten_observation_space(without_images(observed)), image_spaces(observed)
     if _images(cameras) != _images(buffer.image_spaces):
         held = f"images {_images(buffer.image_spaces)}"
