@@ -288,7 +288,10 @@ def known_task(env: VecEnv) -> Task | None:
 
 
 def reader_options(env: VecEnv) -> dict[str, Any]:
-    """Arguments of `load_dataset` that the environment behind a :class:`ReturnToGoWrapper` decides."""
+    """
+    Arguments of `load_dataset` that an environment decides: the `reader_options` of its :class:`ReturnToGoWrapper`, which
+    may lack the time limit, and its action space.
+    """
     (options,) = env.get_attr("reader_options", indices=0)
     return {"action_space": env.action_space, **options}
 

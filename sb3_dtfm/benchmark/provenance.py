@@ -16,7 +16,7 @@ import numpy as np
 import torch as th
 
 import sb3_dtfm
-from sb3_dtfm.data import TrajectoryBuffer, load_dataset, without_pickles
+from sb3_dtfm.data import TrajectoryBuffer, load_dataset_for, without_pickles
 from sb3_dtfm.data.inspection import BEST_SHARE, return_reference
 from sb3_dtfm.data.minari import is_minari, open_minari
 from sb3_dtfm.optimization import multiplies_bfloat16
@@ -89,24 +89,7 @@ def read_data(env_id: str, settings: dict[str, Any]) -> TrajectoryBuffer:
     wrap = get_wrapper_class({"env_wrapper": with_target_return(None, settings.get("env_wrapper"))})
     assert wrap is not None
     with contextlib.closing(wrap(gym.make(env_id, **(settings.get("env_kwargs") or {})))) as env:
-        return read_for(env, settings["dataset"], **without_pickles(settings.get("dataset_kwargs")))
-
-
-def read_for(env: gym.Env, dataset: Any, **options: Any) -> TrajectoryBuffer:
-    """
-    All episodes of a dataset, as `train` reads them for an environment: up to its time limit.
-
-    :param env: environment in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
-    :param dataset: dataset, see :func:`~sb3_dtfm.data.load_dataset`
-    :param options: further arguments of that function
-    :raises DatasetError: it cannot be read, or was recorded on another task; versions may differ
-    """
-    task = env.get_wrapper_attr("known_task")
-    known = {"action_space": env.action_space, **env.get_wrapper_attr("reader_options")}
-    buffer = load_dataset(dataset, **{**known, **options})
-    if task is not None:
-        buffer.check_task(task.env_id)
-    return buffer
+        return load_dataset_for(env, settings["dataset"], **without_pickles(settings.get("dataset_kwargs")))
 
 
 def describe_data(buffer: TrajectoryBuffer, dataset: str, recorded_from: str | None = None) -> dict[str, Any]:

@@ -14,9 +14,8 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_dtfm.actions import ActionSpace, same_actions
-from sb3_dtfm.benchmark.provenance import read_for
 from sb3_dtfm.cli.literals import key_value
-from sb3_dtfm.data import DatasetError, TrajectoryBuffer, check_action_space, load_dataset
+from sb3_dtfm.data import DatasetError, TrajectoryBuffer, check_action_space, load_dataset, load_dataset_for
 from sb3_dtfm.data.decisions import decide, sentences
 from sb3_dtfm.data.inspection import Inspection, Range, inspect_buffer
 from sb3_dtfm.envs import (
@@ -96,9 +95,9 @@ def load(
 def _load_for(
     env_id: str, env_kwargs: Mapping[str, Any], dataset: str | list[str], options: dict[str, Any]
 ) -> TrajectoryBuffer:
-    with contextlib.closing(ReturnToGoWrapper(gym.make(env_id, **env_kwargs))) as env:
-        observed, action_space = env.env.observation_space, env.action_space
-        buffer = read_for(env, dataset, **options)
+    with contextlib.closing(gym.make(env_id, **env_kwargs)) as env:
+        observed, action_space = env.observation_space, env.action_space
+        buffer = load_dataset_for(ReturnToGoWrapper(env), dataset, **options)
     flat, cameras = flatten_observation_space(without_images(observed)), image_spaces(observed)
     if _images(cameras) != _images(buffer.image_spaces):
         held = f"images {_images(buffer.image_spaces)}"

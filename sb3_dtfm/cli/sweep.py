@@ -16,8 +16,9 @@ from tqdm import tqdm
 
 from sb3_dtfm.algorithms import ALGORITHMS
 from sb3_dtfm.benchmark.evaluation import SeededEpisodes, evaluate
-from sb3_dtfm.benchmark.provenance import commit, read_for, versions
+from sb3_dtfm.benchmark.provenance import commit, versions
 from sb3_dtfm.benchmark.report.statistics import Interval, student_t
+from sb3_dtfm.data import load_dataset_for
 from sb3_dtfm.envs import ReturnToGoWrapper
 from sb3_dtfm.files import replacing
 from sb3_dtfm.recording.loading import AgentFiles, algorithm_of, find_agent, load_agent
@@ -66,7 +67,7 @@ def main(argv: Sequence[str]) -> None:
         key_values("--dataset-kwargs", options.dataset_kwargs),
     )
     with contextlib.closing(_wrapper(known)(gym.make(options.env, **_env_kwargs(known, options)))) as env:
-        returns = read_for(env, options.dataset, **dataset_kwargs).episode_returns
+        returns = load_dataset_for(env, options.dataset, **dataset_kwargs).episode_returns
     models = [load_agent(algo, agent.model, "cpu") for algo, agent in zip(algorithms, agents, strict=True)]
     acting = key_values("--acting", options.acting)
     for model in models:

@@ -7,7 +7,7 @@ from sb3_dtfm.data.in_memory import load_episodes, load_replay_buffer, load_step
 from sb3_dtfm.data.lerobot import load_lerobot
 from sb3_dtfm.data.minari import load_minari
 from sb3_dtfm.data.pickles import without_pickles
-from sb3_dtfm.data.readers import Dataset, load_dataset
+from sb3_dtfm.data.readers import Dataset, load_dataset, load_dataset_for
 from sb3_dtfm.data.robomimic import check_controller, load_robomimic
 from sb3_dtfm.data.trajectories import (
     DatasetError,
@@ -29,6 +29,7 @@ __all__ = [
     "check_action_space",
     "check_controller",
     "load_dataset",
+    "load_dataset_for",
     "load_episodes",
     "load_flat",
     "load_lerobot",

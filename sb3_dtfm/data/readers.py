@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
+import gymnasium as gym
 from gymnasium import spaces
 from minari import MinariDataset
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -235,6 +236,22 @@ def load_dataset(
     if max_episode_steps is not None:
         buffer = buffer.within(max_episode_steps)
     return buffer.best(min_return, best_share, success_only).random_fraction(fraction, fraction_seed)
+
+
+def load_dataset_for(env: gym.Env, dataset: Dataset, **options: Any) -> TrajectoryBuffer:
+    """
+    Read all episodes of a dataset as `train` reads them for an environment: up to its time limit.
+
+    :param env: environment in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
+    :param dataset: as for :func:`load_dataset`
+    :param options: further arguments of that function
+    :raises DatasetError: it cannot be read, or was recorded on another task; versions may differ
+    """
+    known = {"action_space": env.action_space, **env.get_wrapper_attr("reader_options")}
+    buffer = load_dataset(dataset, **{**known, **options})
+    if (task := env.get_wrapper_attr("known_task")) is not None:
+        buffer.check_task(task.env_id)
+    return buffer
 
 
 def check_options(given: dict[str, Any]) -> None:

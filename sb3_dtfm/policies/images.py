@@ -14,7 +14,6 @@ from torch.nn import functional as F
 
 from sb3_dtfm.policies.resnet import GroupNorm, ResNet18
 
-# Channels in each group of a group normalisation.
 CHANNELS_PER_GROUP = 8
 # Random crops in a batch on a CPU: slices, since indices for each image take as long as a convolution.
 N_CROPS = 16
@@ -118,7 +117,7 @@ def spatial_softmax(maps: th.Tensor) -> th.Tensor:
     """
     Return where each channel is largest: the mean position under its softmax.
 
-    Channels stay last, as a CPU's convolutions leave them: another order costs a copy of each map, and of all gradients.
+    Channels lie last here, as they mostly do in maps and in their gradients on a CPU, so that neither is copied.
 
     :param maps: (N, C, height, width)
     :return: (N, 2 C) in [-1, 1], the rows of all channels, then the columns

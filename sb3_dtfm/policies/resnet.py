@@ -9,7 +9,6 @@ from torch import nn
 
 # Mean and standard deviation of ImageNet's channels, by which the weights that torchvision publishes expect them.
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-# Channels in each group of a group normalisation.
 CHANNELS_PER_GROUP = 16
 # Buffers of batch normalisation.
 STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
@@ -17,13 +16,15 @@ STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
 
 class GroupNorm(nn.GroupNorm):
     """
-    Group normalisation (Wu and He, 2018) in float32: where channels lie last in memory, PyTorch's takes three to four times
-    as long in bfloat16 on a CPU.
+    Group normalisation (Wu and He, 2018). On a CPU it is computed in the weights' precision: where channels lie last in
+    memory, PyTorch's takes three to four times as long in bfloat16.
     """
 
     def forward(self, maps: th.Tensor) -> th.Tensor:
-        """Map (N, channels, height, width) to the same shape and precision."""
-        return super().forward(maps.float()).to(maps.dtype)
+        """Map (N, channels, height, width) to the same shape, on a CPU also the same precision."""
+        if maps.device.type != "cpu":
+            return super().forward(maps)
+        return super().forward(maps.to(self.weight.dtype)).to(maps.dtype)
 
 
 class ResNet18(BaseFeaturesExtractor):

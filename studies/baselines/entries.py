@@ -16,7 +16,7 @@ from sb3_dtfm.benchmark.evaluation import FINAL_STATES, evaluate, make_seeded_en
 from sb3_dtfm.benchmark.rows import Row, RunKey, read_rows
 from sb3_dtfm.benchmark.settings import Task, task_settings
 from sb3_dtfm.data import TrajectoryBuffer, load_dataset
-from sb3_dtfm.envs import known_task
+from sb3_dtfm.envs import reader_options
 from sb3_dtfm.zoo.arguments import UsageError, read_yaml
 
 HERE = Path(__file__).parent
@@ -140,16 +140,16 @@ def baseline_key(data: Data, baseline: Baseline, seed: int, label: str = "") -> 
     return RunKey(data.task, data.fraction, baseline.name, seed, PROFILE, "-".join(filter(None, (data.name, label))))
 
 
-def export(data: Data, baseline: Baseline, path: Path, max_episode_steps: int | None) -> TrajectoryBuffer:
+def export(data: Data, baseline: Baseline, path: Path, known: Mapping[str, Any]) -> TrajectoryBuffer:
     """
     Write the episodes that a baseline is to learn from, as flat arrays.
 
     :param path: of the `.npz` file
-    :param max_episode_steps: the environment's, up to which ours learn from them
+    :param known: by the environment, see `reader_options`
     :return: the same episodes
     """
     settings = data.settings()
-    options = {"max_episode_steps": max_episode_steps, **(settings.get("dataset_kwargs") or {})}
+    options = {**known, **(settings.get("dataset_kwargs") or {})}
     buffer = load_dataset(settings["dataset"], **options)
     if baseline.best_share is not None:
         buffer = buffer.best(best_share=baseline.best_share)
@@ -222,7 +222,7 @@ def run_baseline(
         tempfile.TemporaryDirectory() as folder,
     ):
         path = Path(folder) / "episodes.npz"
-        export(data, baseline, path, task.max_episode_steps if (task := known_task(vec_env)) else None)
+        export(data, baseline, path, reader_options(vec_env))
         training = process.train(
             path, baseline.settings_for(data), seed, *budget, lambda done, n_steps: say(done, n_steps, "training")
         )

@@ -24,6 +24,7 @@ from sb3_dtfm.envs import (
     check_vec_env,
     flatten_observation_space,
     known_task,
+    reader_options,
     register_gymnasium_robotics,
     return_to_go_space,
 )
@@ -286,14 +287,19 @@ def test_the_task_is_known_where_its_whole_spec_cannot_leave_a_process(vec_env_c
         env = gym.make("Pendulum-v1", max_episode_steps=70)
         return ReturnToGoWrapper(gym.wrappers.TransformReward(env, lambda reward: reward), target_return=0.0)
 
-    venv = vec_env_class([make])
+    venv, env_space = vec_env_class([make]), gym.make("Pendulum-v1").observation_space
     try:
         assert known_task(venv) == ("Pendulum-v1", 70)
+        told = reader_options(venv)
+        assert (told.pop("action_space"), told.pop("observation_space")) == (venv.action_space, env_space)
+        assert told == {"env_args": None, "max_episode_steps": 70}
     finally:
         venv.close()
     bare = gym.make("Pendulum-v1").unwrapped
     bare.spec = None
-    assert known_task(DummyVecEnv([lambda: ReturnToGoWrapper(bare, target_return=0.0)])) is None
+    venv = DummyVecEnv([lambda: ReturnToGoWrapper(bare, target_return=0.0)])
+    assert known_task(venv) is None
+    assert "max_episode_steps" not in reader_options(venv), "no limit is known, which is not to say that there is none"
 
 
 def bare_env() -> gym.Env:

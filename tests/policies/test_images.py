@@ -276,15 +276,23 @@ def test_spatial_softmax_is_the_mean_position(layout):
     weights = maps.reshape(2, 3, 20).softmax(dim=2).view(2, 3, 4, 5)
     rows, columns = th.meshgrid(th.linspace(-1, 1, 4), th.linspace(-1, 1, 5), indexing="ij")
     expected = [(weights * place).sum(dim=(2, 3)) for place in (rows, columns)]
-    th.testing.assert_close(spatial_softmax(maps), th.cat(expected, dim=1))
+    found = spatial_softmax(maps.requires_grad_())
+    th.testing.assert_close(found, th.cat(expected, dim=1))
+    found.square().sum().backward()
+    if layout == th.channels_last:
+        assert maps.grad.is_contiguous(memory_format=layout), "gradients need no copy"
 
 
-def test_group_normalisation_is_computed_in_float32():
-    norm, maps = GroupNorm(2, 4), th.randn(3, 4, 5, 5, generator=th.Generator().manual_seed(0))
+def test_images_of_bfloat16_are_normalised_in_float32_and_stay_in_their_layout(monkeypatch):
+    seen, kernel = [], th.nn.functional.group_norm
+    monkeypatch.setattr(th.nn.functional, "group_norm", lambda maps, *rest: seen.append(maps.dtype) or kernel(maps, *rest))
+    norm, maps = GroupNorm(2, 4), th.randn(3, 4, 5, 6, generator=th.Generator().manual_seed(0))
     low = maps.bfloat16().contiguous(memory_format=th.channels_last)
-    for given in (low, maps):
-        expected = th.nn.functional.group_norm(given.float(), 2, norm.weight, norm.bias).to(given.dtype)
-        th.testing.assert_close(norm(given), expected, rtol=0, atol=0)
+    found = norm(low)
+    assert (seen, found.dtype) == ([th.float32], th.bfloat16)
+    assert found.is_contiguous(memory_format=th.channels_last)
+    th.testing.assert_close(found, kernel(low.float(), 2).bfloat16())
+    assert norm.double()(maps.double()).dtype == th.float64
 
 
 def encoder(class_name, shapes, kwargs=None, normalize_images=True, shared=False):

@@ -89,7 +89,12 @@ def test_a_message_arrives_as_it_was_sent():
 @pytest.mark.parametrize(("fraction", "best_share", "limit"), [(1.0, None, None), (0.6, None, 8), (1.0, 0.4, 9)])
 def test_a_baseline_is_given_the_steps_that_ours_learn_from(datasets, buffer, tmp_path, fraction, best_share, limit):
     data = entries.read_entries(datasets, entries.Data)["pendulum"]._replace(fraction=fraction)
-    entries.export(data, entries.Baseline("any", "d3rlpy", 1, {}, best_share=best_share), tmp_path / "out.npz", limit)
+    entries.export(
+        data,
+        entries.Baseline("any", "d3rlpy", 1, {}, best_share=best_share),
+        tmp_path / "out.npz",
+        {"max_episode_steps": limit},
+    )
     expected = load_dataset(buffer, max_episode_steps=limit).random_fraction(fraction, seed=0)
     expected = expected if best_share is None else expected.best(best_share=best_share)
     given = read_dataset(tmp_path / "out.npz")
