@@ -36,7 +36,7 @@ class ResNet18(BaseFeaturesExtractor):
     :param features_dim: numbers that an image becomes
     :param weights: file of torchvision's weights, as `torch.save(resnet18(...).state_dict(), weights)` writes it; not saved
         with a model, which holds the weights that it has learned. Random weights if not given
-    :raises ImportError: torchvision is not installed
+    :raises ImportError: torchvision is not installed, or was built for another torch
     :raises ValueError: other than three channels, or a file of other weights
     """
 
@@ -49,8 +49,13 @@ class ResNet18(BaseFeaturesExtractor):
         super().__init__(observation_space, features_dim)
         try:
             from torchvision.models import resnet18
-        except ImportError as error:
+        except ModuleNotFoundError as error:
             raise ImportError("ResNet18 needs torchvision: pip install torchvision") from error
+        except (ImportError, RuntimeError) as error:  # such as PyPI's, which needs CUDA, beside a torch for CPUs
+            raise ImportError(
+                f"ResNet18 needs a torchvision that was built for torch {th.__version__}; importing it fails: {error}. "
+                "Install both from the same package index."
+            ) from error
         if observation_space.shape[0] != 3:
             raise ValueError(f"ResNet18 needs images of 3 channels, got {observation_space.shape[0]}.")
         self.network = resnet18(norm_layer=lambda n_channels: GroupNorm(n_channels // CHANNELS_PER_GROUP, n_channels))

@@ -1,6 +1,7 @@
 """Images beside numbers: learned from as bytes, encoded once, and seen alike in data, environments and exported files."""
 
 import runpy
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -194,6 +195,26 @@ def test_torchvisions_resnet_takes_weights_of_a_file(buffer, tmp_path):
     th.save(dict(other=th.zeros(1)), tmp_path / "resnet18.pth")
     with pytest.raises(ValueError, match=r"resnet18\.pth holds no weights of ResNet-18: conv1\.weight is missing"):
         make_model(DT, buffer, policy_kwargs=dict(features_extractor_class="ResNet18", features_extractor_kwargs=kwargs))
+
+
+@pytest.mark.parametrize(
+    ("code", "told"),
+    [
+        ("raise ModuleNotFoundError('No module named torchvision')", "ResNet18 needs torchvision: pip install torchvision"),
+        (
+            "raise RuntimeError('operator torchvision::nms does not exist')",
+            r"built for torch .*fails: operator torchvision::nms does not exist. Install both from the same package index",
+        ),
+    ],
+)
+def test_a_torchvision_that_is_missing_or_does_not_fit_is_told_of(code, told, tmp_path, monkeypatch):
+    (tmp_path / "torchvision").mkdir()
+    (tmp_path / "torchvision" / "__init__.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in [each for each in sys.modules if each.partition(".")[0] == "torchvision"]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(ImportError, match=told):
+        encoder("ResNet18", {"camera": (3, 32, 32)})
 
 
 def test_a_critic_values_what_images_show(buffer):
