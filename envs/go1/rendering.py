@@ -5,6 +5,7 @@ import numpy as np
 
 from sb3_dtfm.envs.go1.model import TRUNK
 from sb3_dtfm.envs.go1.simulation import Simulation
+from sb3_dtfm.envs.rendering import make_renderer
 
 
 class Camera:
@@ -20,7 +21,7 @@ class Camera:
         self._simulation = simulation
         view = simulation.model.vis.global_  # MuJoCo refuses pictures larger than these
         view.offwidth, view.offheight = max(view.offwidth, width), max(view.offheight, height)
-        self._renderer = mujoco.Renderer(simulation.model, height, width)
+        self._renderer = make_renderer(simulation.model, height, width)
         self._view = mujoco.MjvCamera()
         self._view.type, self._view.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, simulation.model.body(TRUNK).id
         self._view.distance, self._view.azimuth, self._view.elevation = 1.5, 120.0, -20.0

@@ -1,11 +1,12 @@
 """robosuite's cameras as observations: upright, in the same light wherever they are drawn."""
 
-import weakref
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+
+from sb3_dtfm.envs.rendering import make_renderer
 
 
 class Cameras:
@@ -35,13 +36,12 @@ class Cameras:
         self.names = list(names)
         self._model = model
         try:
-            self._renderer = mujoco.Renderer(model, size, size)
+            self._renderer = make_renderer(model, size, size)
         except mujoco.FatalError as error:
             raise RuntimeError(
                 f"cameras: MuJoCo cannot draw here ({error}): before Python starts, set MUJOCO_GL to egl or osmesa."
             ) from error
-        # Also when Python ends, before what it draws with is gone.
-        self.close = weakref.finalize(self, self._renderer.close)
+        self.close = self._renderer.close
         self._option = mujoco.MjvOption()
         self._option.geomgroup[0] = 0  # collision shapes
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):

@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_dtfm.envs.rendering import make_renderer
 from sb3_dtfm.envs.robosuite.cameras import Cameras, camera_args
 from sb3_dtfm.envs.robosuite.scene import CONTROL_FREQUENCY, import_robosuite, make_robosuite, scene_xml
 from sb3_dtfm.envs.robosuite.sensors import Observer
@@ -190,7 +191,7 @@ class RobosuiteEnv(gym.Env[Any, np.ndarray]):
             self._viewer.sync()
             return None
         if self._renderer is None:
-            self._renderer = mujoco.Renderer(model, self.height, self.width)
+            self._renderer = make_renderer(model, self.height, self.width)
             self._scene_option = mujoco.MjvOption()
             self._scene_option.geomgroup[0] = 0  # collision shapes
         self._renderer.update_scene(data, camera=self.camera_name, scene_option=self._scene_option)
