@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
+from stable_baselines3.common.vec_env import VecEnv
 
 # As gymnasium.wrappers.AddRenderObservation has them.
 PIXELS, STATE = "pixels", "state"
@@ -58,3 +59,25 @@ class RenderWrapper(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs
         picture: Any = self.env.render()
         parts = observation if isinstance(observation, dict) else {STATE: observation}
         return {PIXELS: resize_image(picture, self._size), **(parts if self._state else {})}
+
+
+class ImagesOnDemand:
+    """
+    Has environments draw the images that a policy looks at, and no others, if they can.
+
+    :param vec_env: robosuite's tasks with cameras, or others
+    """
+
+    def __init__(self, vec_env: VecEnv) -> None:
+        self._vec_env = vec_env
+        self._can = vec_env.has_attr("draw_images")
+        self._drawn = np.zeros(vec_env.num_envs, bool)
+        self.draw(~self._drawn)
+
+    def draw(self, wanted: np.ndarray) -> None:
+        """
+        :param wanted: (n_envs,) bool, those that draw in their next steps
+        """
+        for i in np.flatnonzero(wanted != self._drawn) if self._can else ():
+            self._vec_env.env_method("draw_images", bool(wanted[i]), indices=int(i))
+        self._drawn = wanted

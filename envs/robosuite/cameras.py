@@ -16,6 +16,7 @@ class Cameras:
     where no GPU draws.
 
     :ivar close: frees what draws
+    :ivar images: the newest ones, (size, size, 3) uint8 by key
 
     :param model: MuJoCo's
     :param names: of cameras
@@ -46,6 +47,7 @@ class Cameras:
         self._option.geomgroup[0] = 0  # collision shapes
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._renderer.scene.flags[flag] = False
+        self.images: dict[str, np.ndarray] = {}
         self.space = dict.fromkeys(map(image_key, names), spaces.Box(0, 255, (size, size, 3), np.uint8))
 
     def __call__(self, data: Any) -> dict[str, np.ndarray]:
@@ -56,11 +58,11 @@ class Cameras:
         import mujoco
 
         mujoco.mj_camlight(self._model, data)  # where the hand's camera is after a step, which moves the hand alone
-        images = {}
+        self.images = {}
         for name in self.names:
             self._renderer.update_scene(data, camera=name, scene_option=self._option)
-            images[image_key(name)] = self._renderer.render()
-        return images
+            self.images[image_key(name)] = self._renderer.render()
+        return self.images
 
 
 def camera_args(names: Sequence[str], size: int) -> dict[str, Any]:

@@ -90,6 +90,7 @@ class RobosuiteEnv(gym.Env[Any, np.ndarray]):
         self._observer = Observer(self._env)
         self._camera_size = camera_size
         self._cameras = Cameras(self._env.sim.model._model, cameras, camera_size) if cameras else None
+        self._draws_images = True
         hidden = {"object"} if object_state is False or (cameras and not object_state) else set()
         self._keys = {key: width for key, width in self._observer.keys.items() if key not in hidden}
         vectors = {key: spaces.Box(-np.inf, np.inf, (width,), np.float32) for key, width in self._keys.items()}
@@ -150,7 +151,7 @@ class RobosuiteEnv(gym.Env[Any, np.ndarray]):
             self._draw()
         if self.render_mode == "human":
             self.render()
-        return self._observe(), {"is_success": False}
+        return self._observe(draw=True), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """
@@ -170,7 +171,15 @@ class RobosuiteEnv(gym.Env[Any, np.ndarray]):
         truncated = not success and self._steps >= self.horizon
         if self.render_mode == "human":
             self.render()
-        return self._observe(), float(success), success, truncated, {"is_success": success}
+        return self._observe(self._draws_images), float(success), success, truncated, {"is_success": success}
+
+    def draw_images(self, wanted: bool) -> None:
+        """
+        Choose whether the next steps draw what cameras see, which takes most of a step. For a caller who does not look.
+
+        :param wanted: otherwise steps return the images that were drawn last; a reset draws always
+        """
+        self._draws_images = wanted
 
     def render(self) -> np.ndarray | None:
         """
@@ -207,14 +216,15 @@ class RobosuiteEnv(gym.Env[Any, np.ndarray]):
             self._env.close()
             self._env = None
 
-    def _observe(self) -> Any:
+    def _observe(self, draw: bool) -> Any:
         """The present observation: (O,) float32, or by key where cameras see it."""
         seen = self._observer()
         if self._cameras is None:
             return seen[: sum(self._keys.values())]  # the object's part comes last
         parts = np.split(seen, np.cumsum(list(self._observer.keys.values()))[:-1])
         vectors = {key: part for key, part in zip(self._observer.keys, parts, strict=True) if key in self._keys}
-        return {**self._cameras(self._env.sim.data._data), **vectors}
+        images = self._cameras(self._env.sim.data._data) if draw else self._cameras.images
+        return {**images, **vectors}
 
     def _find_references(self) -> None:
         env, robot = self._env, self._env.robots[0]

@@ -318,6 +318,16 @@ class SequencePolicy(BasePolicy):
             context = self._remembered.remember(before, context)
         return action if vectorized else action.squeeze(axis=0), context
 
+    def looks_next(self, state: tuple[np.ndarray, ...]) -> np.ndarray:
+        """
+        Return whose next images decide anything. Those of steps with planned actions do not, if the context is one step.
+
+        :param state: that :meth:`predict` returned
+        :return: (B,) bool
+        """
+        planned = Context(*state).n_planned > 0
+        return ~planned if self.context_length == 1 else np.ones(len(planned), bool)
+
     def _unpack(self, observation: Any) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], list[np.ndarray], bool]:
         """
         :param observation: as for :meth:`predict`

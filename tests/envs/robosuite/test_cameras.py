@@ -46,6 +46,31 @@ try:
 except ValueError as error:
     print(str(error)[:60])
 wrapped.close()
+
+from sb3_dtfm import DTFM
+from sb3_dtfm.benchmark import evaluation
+from sb3_dtfm.envs.cameras import ImagesOnDemand
+from sb3_dtfm.envs.robosuite.cameras import Cameras
+settings = {"env_wrapper": [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 1.0}}],
+            "env_kwargs": {"cameras": cameras, "camera_size": 48, "horizon": 10}}
+envs = evaluation.make_seeded_envs("robosuite/Lift-v0", settings, 2)
+policy_kwargs = {"chunk_size": 8, "n_action_steps": 4}
+model = DTFM("MultiInputPolicy", envs, "lift.hdf5", dataset_kwargs={"observation_keys": keys}, policy_kwargs=policy_kwargs)
+predict, draw, choose = model.predict, Cameras.__call__, ImagesOnDemand.draw
+for images in ("all", "needed"):
+    acted, drawn = [], []
+    def predict_and_tell(*args, **kwargs):
+        actions, state = predict(*args, **kwargs)
+        acted.append(actions)
+        return actions, state
+    def draw_and_tell(self, data):
+        drawn.append(1)
+        return draw(self, data)
+    model.predict, Cameras.__call__ = predict_and_tell, draw_and_tell
+    ImagesOnDemand.draw = choose if images == "needed" else lambda self, wanted: None
+    episodes = evaluation.evaluate(model, envs, [3, 4, 5])
+    print(images, len(drawn), episodes.lengths, hash(np.stack(acted).tobytes()))
+envs.close()
 """
 
 
@@ -57,4 +82,9 @@ def test_recorded_images_are_the_observed_ones(tmp_path, monkeypatch):
     unknown = "cameras: there is no nowhere; accepted are frontview, birdvi"
     seen = ["agentview_image", "robot0_eye_in_hand_image"]
     told = "--env-kwargs cameras:['agentview', 'robot0_eye_in_hand'] camera_size:48"
-    assert result.stdout.splitlines()[-5:] == [str(keys), told, " ".join(seen), below, unknown], result.stderr
+    lines = result.stdout.splitlines()
+    assert lines[-7:-2] == [str(keys), told, " ".join(seen), below, unknown], result.stderr
+    every, needed = (line.split(" ", 2) for line in lines[-2:])
+    assert every[2] == needed[2]
+    # Of three episodes their starts, and ten steps each or the two that new chunks begin with; two look for seeds.
+    assert (int(every[1]), int(needed[1])) == (3 + 3 * 10 + 2, 3 + 3 * 2)
