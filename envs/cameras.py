@@ -1,13 +1,17 @@
 """Images for policies that learn from them: pictures of an environment as observations, all in one size."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
-from stable_baselines3.common.vec_env import VecEnv
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
 
 # As gymnasium.wrappers.AddRenderObservation has them.
 PIXELS, STATE = "pixels", "state"
@@ -61,23 +65,39 @@ class RenderWrapper(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs
         return {PIXELS: resize_image(picture, self._size), **(parts if self._state else {})}
 
 
-class ImagesOnDemand:
+@contextmanager
+def images_on_demand(vec_env: "VecEnv") -> Iterator[Callable[[np.ndarray], None]]:
     """
-    Has environments draw the images that a policy looks at, and no others, if they can.
+    Environments of this process draw in their next steps only where it is asked for; all draw again at the end.
 
-    :param vec_env: robosuite's tasks with cameras, or others
+    Those that cannot, have a wrapper that may look at images, or live in other processes draw in each step.
+
+    :param vec_env: n environments
+    :return: a function that takes which of them draw, (n,) bool
     """
+    envs = _drawing_envs(vec_env)
 
-    def __init__(self, vec_env: VecEnv) -> None:
-        self._vec_env = vec_env
-        self._can = vec_env.has_attr("draw_images")
-        self._drawn = np.zeros(vec_env.num_envs, bool)
-        self.draw(~self._drawn)
+    def draw(wanted: np.ndarray) -> None:
+        for env, each in zip(envs, wanted, strict=False):
+            env.draw_images(bool(each))
 
-    def draw(self, wanted: np.ndarray) -> None:
-        """
-        :param wanted: (n_envs,) bool, those that draw in their next steps
-        """
-        for i in np.flatnonzero(wanted != self._drawn) if self._can else ():
-            self._vec_env.env_method("draw_images", bool(wanted[i]), indices=int(i))
-        self._drawn = wanted
+    try:
+        yield draw
+    finally:
+        draw(np.ones(len(envs), bool))
+
+
+def _drawing_envs(vec_env: "VecEnv") -> list[Any]:
+    """The robosuite environments in `vec_env` if all that wraps them passes images on unseen, else none."""
+    from stable_baselines3.common.monitor import Monitor
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecTransposeImage
+
+    passing = (Monitor, TimeLimit, OrderEnforcing, PassiveEnvChecker)
+    while isinstance(vec_env, VecTransposeImage):
+        vec_env = vec_env.venv
+    envs = list(vec_env.envs) if isinstance(vec_env, DummyVecEnv) else []
+    for i, env in enumerate(envs):
+        while isinstance(env, passing) or getattr(type(env), "passes_images", False):
+            env = env.env
+        envs[i] = env
+    return envs if all(hasattr(env, "draw_images") and env is env.unwrapped for env in envs) else []

@@ -4,24 +4,29 @@ import atexit
 import weakref
 from typing import Any
 
+_renderers: "weakref.WeakSet[Any]" = weakref.WeakSet()
+
 
 def make_renderer(model: Any, height: int, width: int) -> Any:
     """
     Return a MuJoCo renderer that need not be closed. Otherwise one that is open when Python ends fails with many lines.
 
-    :param model: MuJoCo's
+    :param model: MuJoCo's, which gets room for pictures of this size
     :param height: pixels
     :param width: pixels
     :raises mujoco.FatalError: nothing can be drawn on this machine as it is set up
     """
     import mujoco
 
+    room = model.vis.global_
+    room.offheight, room.offwidth = max(room.offheight, height), max(room.offwidth, width)
     renderer = mujoco.Renderer(model, height, width)
-    atexit.register(_close, weakref.ref(renderer))  # after MuJoCo's own, so before it
+    _renderers.add(renderer)
+    atexit.unregister(_close_all)
+    atexit.register(_close_all)  # after MuJoCo's own, so it runs before it
     return renderer
 
 
-def _close(renderer: "weakref.ref[Any]") -> None:
-    still_there = renderer()
-    if still_there is not None:
-        still_there.close()
+def _close_all() -> None:
+    for renderer in list(_renderers):
+        renderer.close()

@@ -99,6 +99,8 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     :raises ValueError: `target_return` is not a finite number, or the observation space cannot be flattened
     """
 
+    passes_images = True  # see :func:`~sb3_dtfm.envs.cameras.images_on_demand`
+
     def __init__(self, env: gym.Env, target_return: float | None = None, bound_return_to_go: bool = True) -> None:
         RecordConstructorArgs.__init__(self, target_return=target_return, bound_return_to_go=bound_return_to_go)
         super().__init__(env)

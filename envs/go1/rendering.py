@@ -19,8 +19,6 @@ class Camera:
 
     def __init__(self, simulation: Simulation, width: int, height: int) -> None:
         self._simulation = simulation
-        view = simulation.model.vis.global_  # MuJoCo refuses pictures larger than these
-        view.offwidth, view.offheight = max(view.offwidth, width), max(view.offheight, height)
         self._renderer = make_renderer(simulation.model, height, width)
         self._view = mujoco.MjvCamera()
         self._view.type, self._view.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, simulation.model.body(TRUNK).id

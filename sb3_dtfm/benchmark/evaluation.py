@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_dtfm.benchmark import provenance
 from sb3_dtfm.benchmark.rows import Row, RowError, RunKey, read_rows, write_row
-from sb3_dtfm.envs.cameras import ImagesOnDemand
+from sb3_dtfm.envs.cameras import images_on_demand
 from sb3_dtfm.envs.seeding import warn_of_seeds
 from sb3_dtfm.envs.success import reported_success
 from sb3_dtfm.files import replacing
@@ -56,6 +56,7 @@ class SeededEpisodes(gym.Wrapper):
     The first environment of its kind is reset twice, and a warning says so if it does not start from its seed.
     """
 
+    passes_images = True  # see :func:`~sb3_dtfm.envs.cameras.images_on_demand`
     _checked: ClassVar[set[type]] = set()
 
     def __init__(self, env: gym.Env) -> None:
@@ -129,21 +130,21 @@ def evaluate(
     observations, state, starts = vec_env.reset(), None, np.ones(n_envs, bool)
     returns, lengths = np.zeros(n_envs), np.zeros(n_envs, int)
     results: dict[int, tuple[float, int, Any]] = {}
-    images, looks_next = ImagesOnDemand(vec_env), getattr(getattr(model, "policy", None), "looks_next", None)
-    while len(results) < n_episodes:
-        actions, state = model.predict(observations, state, starts, deterministic=True)  # type: ignore[arg-type]
-        if looks_next is not None:
-            images.draw(looks_next(state))
-        observations, rewards, starts, infos = vec_env.step(actions)
-        returns, lengths = returns + rewards, lengths + 1
-        for i in np.flatnonzero(starts):
-            if playing[i] < n_episodes:
-                results[int(playing[i])] = (round(float(returns[i]), 4), int(lengths[i]), reported_success(infos[i]))
-            playing[i] += n_envs
-        returns[starts], lengths[starts] = 0.0, 0
-        if after_step is not None:
-            after_step(len(results))
-    images.draw(np.ones(n_envs, bool))
+    looks_next = getattr(getattr(model, "policy", None), "looks_next", None)
+    with images_on_demand(vec_env) as draw:
+        while len(results) < n_episodes:
+            actions, state = model.predict(observations, state, starts, deterministic=True)  # type: ignore[arg-type]
+            if looks_next is not None:
+                draw(looks_next(state))
+            observations, rewards, starts, infos = vec_env.step(actions)
+            returns, lengths = returns + rewards, lengths + 1
+            for i in np.flatnonzero(starts):
+                if playing[i] < n_episodes:
+                    results[int(playing[i])] = (round(float(returns[i]), 4), int(lengths[i]), reported_success(infos[i]))
+                playing[i] += n_envs
+            returns[starts], lengths[starts] = 0.0, 0
+            if after_step is not None:
+                after_step(len(results))
     all_returns, all_lengths, successes = map(list, zip(*(results[episode] for episode in range(n_episodes)), strict=True))
     return Episodes(all_returns, all_lengths, None if None in successes else successes)
 

@@ -11,7 +11,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from sb3_dtfm.data import ReturnReference
-from sb3_dtfm.envs.cameras import ImagesOnDemand
+from sb3_dtfm.envs.cameras import images_on_demand
 from sb3_dtfm.envs.success import reported_success
 from sb3_dtfm.files import printable, read_run
 
@@ -59,10 +59,9 @@ class MeasureRandomActions(BaseCallback):
         model: Any = self.model
         for evaluation in self.eval_callbacks[:1]:
             random: Any = RandomActions(evaluation.eval_env, self.seed)
-            images = ImagesOnDemand(evaluation.eval_env)
-            images.draw(np.zeros(random.n_envs, bool))
-            mean: Any = evaluate_policy(random, evaluation.eval_env, N_RANDOM_EPISODES, callback=self.after_step)[0]
-            images.draw(np.ones(random.n_envs, bool))
+            with images_on_demand(evaluation.eval_env) as draw:
+                draw(np.zeros(random.n_envs, bool))
+                mean: Any = evaluate_policy(random, evaluation.eval_env, N_RANDOM_EPISODES, callback=self.after_step)[0]
             model.return_reference = model.return_reference._replace(random=float(mean))
 
     def _on_step(self) -> bool:

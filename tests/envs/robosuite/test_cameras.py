@@ -45,46 +45,82 @@ try:
     gymnasium.make("robosuite/Lift-v0", cameras=["nowhere"])
 except ValueError as error:
     print(str(error)[:60])
-wrapped.close()
 
 from sb3_dtfm import DTFM
 from sb3_dtfm.benchmark import evaluation
-from sb3_dtfm.envs.cameras import ImagesOnDemand
+from sb3_dtfm.envs.cameras import images_on_demand
 from sb3_dtfm.envs.robosuite.cameras import Cameras
-settings = {"env_wrapper": [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 1.0}}],
-            "env_kwargs": {"cameras": cameras, "camera_size": 48, "horizon": 10}}
-envs = evaluation.make_seeded_envs("robosuite/Lift-v0", settings, 2)
-policy_kwargs = {"chunk_size": 8, "n_action_steps": 4}
-model = DTFM("MultiInputPolicy", envs, "lift.hdf5", dataset_kwargs={"observation_keys": keys}, policy_kwargs=policy_kwargs)
-predict, draw, choose = model.predict, Cameras.__call__, ImagesOnDemand.draw
-for images in ("all", "needed"):
-    acted, drawn = [], []
-    def predict_and_tell(*args, **kwargs):
-        actions, state = predict(*args, **kwargs)
-        acted.append(actions)
-        return actions, state
-    def draw_and_tell(self, data):
-        drawn.append(1)
-        return draw(self, data)
-    model.predict, Cameras.__call__ = predict_and_tell, draw_and_tell
-    ImagesOnDemand.draw = choose if images == "needed" else lambda self, wanted: None
-    episodes = evaluation.evaluate(model, envs, [3, 4, 5])
-    print(images, len(drawn), episodes.lengths, hash(np.stack(acted).tobytes()))
+wrappers = [{"sb3_dtfm.envs.ReturnToGoWrapper": {"target_return": 1.0}}]
+env_kwargs = {"cameras": cameras, "camera_size": 48, "horizon": 10}
+class Unknown(gymnasium.Wrapper):
+    pass
+draw, drawn = Cameras.__call__, []
+Cameras.__call__ = lambda self, data: drawn.append(1) or draw(self, data)
+def count(model, wrappers, n_envs=2, as_needed=True):
+    # images drawn in three episodes, and what was done in them
+    envs = evaluation.make_seeded_envs("robosuite/Lift-v0", {"env_wrapper": wrappers, "env_kwargs": env_kwargs}, n_envs)
+    envs.reset()
+    acted = []
+    class Told:
+        policy = model.policy if as_needed else None
+        def predict(self, *args, **kwargs):
+            actions, state = model.predict(*args, **kwargs)
+            acted.append(actions)
+            return actions, state
+    drawn.clear()
+    episodes = evaluation.evaluate(Told(), envs, [3, 4, 5])
+    n_drawn = len(drawn)
+    assert all(env.unwrapped._draws_images for env in envs.envs)
+    envs.close()
+    return n_drawn, episodes.lengths, hash(np.stack(acted).tobytes())
+def learned(context_length):
+    return DTFM("MultiInputPolicy", wrapped, "lift.hdf5", dataset_kwargs={"observation_keys": keys},
+                context_length=context_length, policy_kwargs={"chunk_size": 8, "n_action_steps": 4})
+one, two = learned(1), learned(2)
+wrapped.close()
+print(count(one, wrappers, as_needed=False) + count(one, wrappers))
+print(count(two, wrappers)[0], count(one, ["__main__.Unknown", *wrappers])[0])
+envs = evaluation.make_seeded_envs("robosuite/Lift-v0", {"env_wrapper": wrappers, "env_kwargs": env_kwargs}, 1)
+drawn.clear()
+try:
+    with images_on_demand(envs) as choose:
+        envs.reset()
+        choose(np.zeros(1, bool))
+        envs.step(np.zeros((1, 7)))
+        raise KeyboardInterrupt
+except KeyboardInterrupt:
+    print(len(drawn), envs.envs[0].unwrapped._draws_images)
 envs.close()
 """
 
 
-def test_recorded_images_are_the_observed_ones(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    result = run_python(SEEN, MUJOCO_GL=BACKEND)
+@pytest.fixture(scope="module")
+def told(tmp_path_factory):
+    """What the program prints, which takes as long to start as all that it does."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("cameras"))
+        result = run_python(SEEN, MUJOCO_GL=BACKEND)
+    assert result.returncode == 0, result.stderr
+    return result.stdout.splitlines()[-8:]
+
+
+def test_recorded_images_are_the_observed_ones(told):
     keys = ["agentview_image", "robot0_eef_pos", "robot0_eef_quat", "robot0_eye_in_hand_image", "robot0_gripper_qpos"]
     below = "1 the cube lies below the arm"
     unknown = "cameras: there is no nowhere; accepted are frontview, birdvi"
     seen = ["agentview_image", "robot0_eye_in_hand_image"]
-    told = "--env-kwargs cameras:['agentview', 'robot0_eye_in_hand'] camera_size:48"
-    lines = result.stdout.splitlines()
-    assert lines[-7:-2] == [str(keys), told, " ".join(seen), below, unknown], result.stderr
-    every, needed = (line.split(" ", 2) for line in lines[-2:])
-    assert every[2] == needed[2]
-    # Of three episodes their starts, and ten steps each or the two that new chunks begin with; two look for seeds.
-    assert (int(every[1]), int(needed[1])) == (3 + 3 * 10 + 2, 3 + 3 * 2)
+    arguments = "--env-kwargs cameras:['agentview', 'robot0_eye_in_hand'] camera_size:48"
+    assert told[:5] == [str(keys), arguments, " ".join(seen), below, unknown]
+
+
+def test_an_evaluation_draws_what_the_policy_looks_at_and_is_the_same(told):
+    n_all, lengths, actions, n_needed, lengths_again, actions_again = eval(told[5])  # tuples of numbers
+    assert (lengths_again, actions_again) == (lengths, actions)
+    # Of three episodes of ten steps their starts, and each step or the two with which new chunks begin.
+    assert (n_all, n_needed) == (3 + 3 * 10, 3 + 3 * 2)
+    assert lengths == [10, 10, 10]
+
+
+def test_images_are_drawn_where_anyone_may_look(told):
+    assert told[6] == "33 33"  # a longer context, and a wrapper that nobody knows
+    assert told[7] == "1 True"  # after an exception
