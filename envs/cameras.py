@@ -95,7 +95,7 @@ def _drawing_envs(vec_env: "VecEnv") -> list[Any]:
     passing = (Monitor, TimeLimit, OrderEnforcing, PassiveEnvChecker)
     while isinstance(vec_env, VecTransposeImage):
         vec_env = vec_env.venv
-    envs = list(vec_env.envs) if isinstance(vec_env, DummyVecEnv) else []
+    envs: list[Any] = list(vec_env.envs) if isinstance(vec_env, DummyVecEnv) else []
     for i, env in enumerate(envs):
         while isinstance(env, passing) or getattr(type(env), "passes_images", False):
             env = env.env
