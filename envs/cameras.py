@@ -39,7 +39,7 @@ class RenderWrapper(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs
     Observes what an environment renders, in one size, beside what it observes itself: a Dict of `pixels` and of the
     environment's own entries, or its `state`. :class:`gymnasium.wrappers.AddRenderObservation` does so without a size.
 
-    :param env: of `render_mode="rgb_array"`
+    :param env: environment of `render_mode="rgb_array"`
     :param size: height and width of the image, pixels; a number means both
     :param state: show what the environment observes itself; without it the image is all
     :raises ValueError: another render mode, or the environment has an entry `pixels` itself

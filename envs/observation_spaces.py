@@ -16,7 +16,7 @@ TIMESTEP = "timestep"
 IMAGE = "image"
 # Numbers of channels that images have.
 CHANNELS = (1, 3, 4)
-# Sides from which on a matrix may be a picture, pixels.
+# Length of both sides from which on a matrix may be a picture, pixels.
 SMALLEST_PICTURE = 16
 # Names of what ReturnToGoWrapper shows and of a step's arrays, which no image may have.
 RESERVED = {OBSERVATION, RETURN_TO_GO, TIMESTEP, "observations", "actions", "rewards", "returns_to_go"}
@@ -26,7 +26,7 @@ def image_spaces(space: spaces.Space) -> dict[str, spaces.Box]:
     """
     The images that an environment shows, by camera.
 
-    :param space: its observation space: an image itself, which is called `image`, or a Dict of images and others
+    :param space: observation space: an image itself, which is called `image`, or a Dict of images and others
     :return: Box of uint8, as the environment has them
     """
     parts = space.spaces if isinstance(space, spaces.Dict) else {IMAGE: space}
@@ -42,7 +42,7 @@ def check_image_shape(shape: tuple[int, ...], name: str) -> None:
     Refuse an image whose channels cannot be told from height and width.
 
     :param shape: (height, width, channels), or channels first
-    :param name: of the image, for the message
+    :param name: name of the image, for the message
     :raises ValueError: 1, 3 or 4 neither at the first nor at the last place, or at both
     """
     if (shape[0] in CHANNELS) == (shape[2] in CHANNELS):
@@ -53,7 +53,7 @@ def looks_like_images(shape: tuple[int, ...]) -> bool:
     """
     Return whether numbers other than bytes have the shape of an image, or of several.
 
-    :param shape: of a step
+    :param shape: shape of the numbers at a step
     """
     if len(shape) < 3:
         return False
@@ -66,7 +66,7 @@ def warn_if_a_picture(shape: tuple[int, ...]) -> None:
     """
     Say that a matrix as large as a picture becomes a vector.
 
-    :param shape: of a step
+    :param shape: shape of the numbers at a step
     """
     if len(shape) == 2 and min(shape) >= SMALLEST_PICTURE:
         warnings.warn(
@@ -142,7 +142,7 @@ def check_cameras(images: Iterable[str]) -> None:
     """
     Refuse images whose names stand for something else.
 
-    :param images: their names
+    :param images: names of the images
     :raises ValueError: a name of what ReturnToGoWrapper shows, or of a step's arrays
     """
     if taken := sorted(RESERVED.intersection(images)):
@@ -163,8 +163,8 @@ def return_to_go_space(observation_space: spaces.Space, images: Mapping[str, spa
     """
     Observation space of a sequence policy, for an environment or for a dataset.
 
-    :param observation_space: of the bare environment, or the flat one of a dataset's buffer
-    :param images: of a dataset's buffer; those in `observation_space` by default
+    :param observation_space: observation space of the bare environment, or the flat one of a dataset's buffer
+    :param images: image spaces of a dataset's buffer, by camera; those in `observation_space` by default
     :return: Dict of `observation` (O,) float32, `return_to_go` (1,) float32, `timestep` (1,) int64, and images by camera
     :raises ValueError: `observation_space` cannot be flattened, or an image cannot be used
     """

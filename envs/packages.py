@@ -13,8 +13,8 @@ def import_packages(modules: Sequence[str], where: str = "--gym-packages") -> No
     Import what registers tasks, as RL-Zoo's `--gym-packages` does, also from the current folder; gymnasium-robotics needs no
     mention.
 
-    :param modules: dotted names
-    :param where: they were named, for the message
+    :param modules: dotted names of modules
+    :param where: name of the option that listed them, for the message
     :raises ValueError: there is none of that name
     """
     register_gymnasium_robotics()

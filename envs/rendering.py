@@ -1,4 +1,4 @@
-"""What draws MuJoCo's scenes, freed before MuJoCo ends what it draws with."""
+"""MuJoCo's renderers, freed before MuJoCo ends what they draw with."""
 
 import atexit
 import weakref
@@ -11,9 +11,9 @@ def make_renderer(model: Any, height: int, width: int) -> Any:
     """
     Return a MuJoCo renderer that need not be closed. Otherwise one that is open when Python ends fails with many lines.
 
-    :param model: MuJoCo's, which gets room for pictures of this size
-    :param height: pixels
-    :param width: pixels
+    :param model: MuJoCo model, which gets room for pictures of this size
+    :param height: height of the pictures, pixels
+    :param width: width of the pictures, pixels
     :raises mujoco.FatalError: nothing can be drawn on this machine as it is set up
     """
     import mujoco

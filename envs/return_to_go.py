@@ -45,7 +45,7 @@ def check_target_return(target_return: float) -> float:
     """
     The target as a float.
 
-    :param target_return: environment reward units
+    :param target_return: target return, environment reward units
     :raises ValueError: not a finite number, or one that float32 cannot hold
     """
     try:
@@ -62,7 +62,7 @@ class Task(NamedTuple):
     A registered task.
 
     :param env_id: Gymnasium id
-    :param max_episode_steps: after which Gymnasium ends an episode; None where it does not
+    :param max_episode_steps: number of steps after which Gymnasium ends an episode; None where it does not
     """
 
     env_id: str
@@ -95,7 +95,8 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     :param env: the environment to wrap
     :param target_return: target return of each episode, environment reward units; None takes the model's
-    :param bound_return_to_go: keep that bound; False shows the target less the rewards, as Decision Transformer does
+    :param bound_return_to_go: whether to keep that bound; without it the target less the rewards is shown, as Decision
+        Transformer does
     :raises ValueError: `target_return` is not a finite number, or the observation space cannot be flattened
     """
 
@@ -142,7 +143,7 @@ class ReturnToGoWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """
         Set the target return from the next reset on; also through ``VecEnv.env_method("set_target_return", value)``.
 
-        :param target_return: environment reward units
+        :param target_return: target return, environment reward units
         :raises ValueError: not a finite number
         """
         self.target_return = check_target_return(target_return)
@@ -239,7 +240,7 @@ def check_vec_env(
     Make sure that return-to-go and time step reach the policy unharmed.
 
     :param env: the environment
-    :param name: of it, for messages
+    :param name: name of the environment, for messages
     :param remedy: the line that wraps it, for messages
     :raises ValueError: no :class:`ReturnToGoWrapper` inside, or normalised or stacked observations
     """
@@ -302,8 +303,8 @@ def share_target_return(env: VecEnv, target_return: float | None) -> float | Non
     """
     Set the target return of each :class:`ReturnToGoWrapper` that has none.
 
-    :param env: wrapped inside
-    :param target_return: environment reward units; None takes the first target that there is
+    :param env: vectorised environment, wrapped inside
+    :param target_return: target return, environment reward units; None takes the first target that there is
     :return: the target return, None where none is known
     """
     targets = env.get_attr("target_return")

@@ -21,7 +21,7 @@ OBJECTS = {
 
 def register_gymnasium_robotics() -> None:
     """
-    Make its ids work, as importing it does, where it is installed.
+    Make the ids of gymnasium-robotics work, as importing it does, where it is installed.
 
     It is imported when a task may be one of its own, since that takes half a second and MuJoCo, and in silence: its notice
     is about the tasks that :func:`warn_of_reward` warns of.
@@ -50,7 +50,7 @@ class AdroitReward(gym.RewardWrapper, RecordConstructorArgs):
     The reward of Rajeswaran et al. (2018) for version 1 of Adroit's Door, Hammer and Relocate, as in gymnasium-robotics
     before 1.2.1: the distance between palm and object counts against the hand.
 
-    :param env: one of these tasks, with its dense reward
+    :param env: environment of one of these tasks, with its dense reward
     :raises ValueError: another task
     """
 
@@ -64,8 +64,8 @@ class AdroitReward(gym.RewardWrapper, RecordConstructorArgs):
 
     def reward(self, reward: SupportsFloat) -> float:
         """
-        :param reward: the environment's
-        :return: with the sign of the distance turned
+        :param reward: reward of the environment
+        :return: reward with the sign of the distance turned
         """
         task: Any = self.env.unwrapped
         palm = task.grasp_site_id if hasattr(task, "grasp_site_id") else task.S_grasp_site_id
@@ -80,7 +80,7 @@ def warn_of_reward(env: gym.Env) -> None:
     """
     Warn once of a task whose reward is not the published one, where no :class:`AdroitReward` mends it.
 
-    :param env: perhaps in wrappers
+    :param env: environment, with or without wrappers
     """
     inner = env
     while isinstance(inner, gym.Wrapper):

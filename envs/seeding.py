@@ -12,8 +12,8 @@ def warn_of_seeds(env: gym.Env, consequence: str, seed: int = 0) -> None:
     Reset an environment twice with the same seed, and warn if it does not show the same.
 
     :param env: the environment
-    :param consequence: for the message
-    :param seed: to reset with
+    :param consequence: clause that says what follows, for the message
+    :param seed: seed to reset with
     """
     first, second = (copy.deepcopy(env.reset(seed=seed)[0]) for _ in range(2))
     if not data_equivalence(first, second):

@@ -10,8 +10,8 @@ def reported_success(info: dict[str, Any]) -> bool | None:
     """
     Return whether an episode succeeded.
 
-    :param info: of the episode's last step
-    :return: None where it says nothing
+    :param info: `info` of the episode's last step
+    :return: success of the episode; None where `info` says nothing
     """
     success = next((info[name] for name in SUCCESS if name in info), None)
     return None if success is None else bool(success)

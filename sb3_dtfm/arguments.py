@@ -20,10 +20,10 @@ class Number(NamedTuple):
 
     :param low: smallest value
     :param high: largest value
-    :param whole: only whole numbers
-    :param above_low: `low` itself is not accepted
-    :param below_high: `high` itself is not accepted
-    :param optional: None is accepted, too
+    :param whole: whether only whole numbers are accepted
+    :param above_low: whether `low` itself is refused
+    :param below_high: whether `high` itself is refused
+    :param optional: whether None is accepted, too
     """
 
     low: float = -math.inf
@@ -86,9 +86,9 @@ class Listed(NamedTuple):
     """
     A list of numbers, or of lists of them.
 
-    :param rule: of each number
-    :param length: of the list, None for any
-    :param nested: an entry may be such a list of any length
+    :param rule: rule for each number
+    :param length: length of the list, None for any
+    :param nested: whether an entry may be such a list of any length
     """
 
     rule: Rule
@@ -130,8 +130,8 @@ PROBABILITY_BELOW_1 = Number(low=0, high=1, below_high=True)
 def check_arguments(given: Mapping[str, Any], accepted: Mapping[str, Rule]) -> dict[str, Any]:
     """
     :param given: values by name; others than `accepted` are left alone
-    :param accepted: what each name may be
-    :return: the accepted ones, NumPy's scalars as Python's, which every file format can hold
+    :param accepted: rule for each argument, by name
+    :return: values of these arguments by name, NumPy's scalars as Python's, which every file format can hold
     :raises ValueError: names the argument, what was given and what is accepted
     """
     values = {name: given[name].item() if isinstance(given[name], np.generic) else given[name] for name in accepted}
@@ -143,7 +143,7 @@ def check_arguments(given: Mapping[str, Any], accepted: Mapping[str, Rule]) -> d
 
 def whole_timesteps(total_timesteps: Any, reset_num_timesteps: bool) -> int:
     """
-    :param total_timesteps: of `learn`; 1e5 is whole, too
+    :param total_timesteps: value of this argument of `learn`; 1e5 is whole, too
     :param reset_num_timesteps: whether they count from zero; else what is left of them may be below 0
     :raises ValueError: no such number
     """
@@ -158,9 +158,9 @@ def option(default: Any, rule: Rule, acting: bool = False) -> Any:
     """
     A field of :class:`Options`.
 
-    :param default: its value where none is given
+    :param default: value where none is given
     :param rule: the accepted values
-    :param acting: it may change after training
+    :param acting: whether it may change after training
     """
     return dataclasses.field(default=default, metadata={"rule": rule, "acting": acting})
 
@@ -207,9 +207,9 @@ def with_nearest(names: Iterable[str], known: Iterable[str]) -> str:
     """
     Unknown names, for a message, each with the known one that may be meant.
 
-    :param names: as the user spelled them
-    :param known: all that are accepted
-    :return: for example "bach_size (did you mean batch_size?)"
+    :param names: unknown names as the user spelled them
+    :param known: names that are accepted
+    :return: list such as "bach_size (did you mean batch_size?)"
     """
     known = list(known)
     nearest = {name: difflib.get_close_matches(name, known, n=1) for name in names}
@@ -221,7 +221,7 @@ def documented_parameters(*described: type, order: Iterable[str] = (), decided: 
     The `:param` entries of classes' docstrings, those of :class:`Options` with their defaults and ranges.
 
     :param described: the classes
-    :param order: of parameters; others follow
+    :param order: names of the parameters that come first, in this order; others follow
     :param decided: names of options that the data decide by default
     """
     found: dict[str, str] = {}

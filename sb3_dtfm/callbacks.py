@@ -23,7 +23,7 @@ from sb3_dtfm.files import printable
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Paths in a picture of the flow, and how far it reaches: what little noise lies beyond only makes the rest small.
+# Paths in a picture of the flow, and how far it reaches: showing the little noise beyond would only make the rest small.
 N_PATHS, REACH = 300, 2.2
 # Fewest gradient steps and seconds that are timed at first, to predict the time of the others.
 N_TIMED, SECONDS_TIMED = 3, 5.0
@@ -48,9 +48,9 @@ def combine_callbacks(
     """
     A user's callbacks with those of the learn loop.
 
-    :param callback: as SB3's `learn` takes it
+    :param callback: the user's callback or callbacks, as SB3's `learn` takes them
     :param score_reference: scale of the normalised score, which is logged where there is one
-    :param own: behind the user's
+    :param own: callbacks of the learn loop, which come behind the user's
     :return: all of them, and those that evaluate
     """
     if isinstance(callback, list):
@@ -119,7 +119,7 @@ class SeedEvaluations(BaseCallback):
     evaluates as it would have. Put it before the callbacks that evaluate.
 
     :param eval_callbacks: the evaluations
-    :param seed: of the run
+    :param seed: seed of the run
     """
 
     def __init__(self, eval_callbacks: list[EvalCallback], seed: int) -> None:
@@ -245,7 +245,7 @@ class FlowFigure(BaseCallback):
 
     Each picture shows the same recorded window, so that they tell how the flow changes while it is learned.
 
-    :param seed: which window, and which noise
+    :param seed: seed of the window and of the noise
     """
 
     def __init__(self, seed: int = 0) -> None:
@@ -265,9 +265,9 @@ def draw_flow(policy: Any, window: Any, seed: int = 0) -> "Figure":
     """
     Draw where a flow takes noise, for the newest step of a window.
 
-    :param policy: DTFM's, of actions of two numbers, one a step
-    :param window: of a buffer, (1, K, ...)
-    :param seed: of the noise
+    :param policy: DTFM's policy for actions of two numbers, one action at a time
+    :param window: window of a buffer, (1, K, ...)
+    :param seed: seed of the noise
     :raises ValueError: other actions, or no flow
     """
     from matplotlib.figure import Figure
@@ -296,10 +296,10 @@ def flow_paths(head: Any, hidden: th.Tensor, noise: th.Tensor, n_points: int = 5
     """
     Return the flow's paths from noise to actions.
 
-    :param head: a flow's
+    :param head: head of a flow
     :param hidden: (..., D)
     :param noise: (..., A), standard normal
-    :param n_points: N, at equal distances in time, by as many Euler steps
+    :param n_points: N, number of Euler steps, equally long in time
     :return: (N + 1, ..., A), the noise first, the actions last
     """
     points: list[th.Tensor] = []

@@ -109,7 +109,7 @@ class DataParallel:
         This process's part of the policy's loss: the mean over all processes is the loss of the whole batch.
 
         :param batch: the whole batch, (B, K, ...)
-        :param noise: what the policy draws for the whole batch, each (B, ...)
+        :param noise: random numbers that the policy has drawn for the whole batch, each (B, ...)
         :return: the loss to minimise, whose gradient will be the whole batch's, and its parts by their logged names
         """
         if self.n_processes == 1:

@@ -17,7 +17,7 @@ LEARNING_RATE_SCHEDULES = ("constant", "linear", "cosine")
 PRECISIONS = ("auto", "float32", "bfloat16")
 # Logged numbers that have to be finite.
 FINITE = ("loss", "grad_norm", "critic_loss")
-# Rows and repetitions that decide which of them is faster on a CPU.
+# Rows and repetitions of the products that decide which precision is faster on a CPU.
 TIMED_ROWS, N_TIMES = 512, 5
 # Multiplications of a gradient step up to which one thread is as quick as two, which wait for one another.
 ONE_THREADS_MACS = 3e9
@@ -52,10 +52,10 @@ def choose_precision(network: nn.Module, n_rows: int, device: th.device, n_proce
     Precision of "auto", and why: bfloat16 where the hardware multiplies in it, on a CPU only if that is faster than
     float32 for the network's own products, which are timed once for each process.
 
-    :param network: its linear layers and convolutions count, these as products of the weights that an output needs
+    :param network: network whose linear layers and convolutions count, the latter as products of an output's weights
     :param n_rows: rows that a gradient step multiplies by a weight
-    :param device: where training runs
-    :param n_processes: that train together, and would each measure for themselves
+    :param device: device that training runs on
+    :param n_processes: number of processes that train together, each of which would measure for itself
     :return: "float32" or "bfloat16", and a sentence
     """
     if device.type == "cpu" and n_processes > 1:
@@ -78,10 +78,10 @@ def products_ms(precision: str, shapes: tuple[tuple[int, int], ...], n_rows: int
     Milliseconds of one linear layer of each shape on the CPU, forward and backward.
 
     :param precision: "float32" or "bfloat16"
-    :param shapes: of the weights, (outputs, inputs)
-    :param n_rows: of what is multiplied by them
-    :param n_threads: that torch uses, a part of what is remembered
-    :return: the shortest of a few times
+    :param shapes: shapes of the weights, (outputs, inputs)
+    :param n_rows: number of rows that are multiplied by the weights
+    :param n_threads: number of threads that torch uses, for which the result is cached
+    :return: shortest of a few times, ms
     """
     layers = [(th.ones(n_rows, n, requires_grad=True), th.ones(m, n, requires_grad=True)) for m, n in shapes]
     times = []
@@ -100,7 +100,7 @@ def autocast(precision: str, device: th.device) -> th.autocast:
     The context that training computes its loss in.
 
     :param precision: "float32" or "bfloat16"
-    :param device: where training runs
+    :param device: device that training runs on
     """
     return th.autocast(device.type, dtype=th.bfloat16, enabled=precision == "bfloat16")
 
@@ -108,9 +108,9 @@ def autocast(precision: str, device: th.device) -> th.autocast:
 @contextlib.contextmanager
 def limit_threads(n_macs: float) -> Iterator[None]:
     """
-    One thread for little work; as many as ever for more, and where `OMP_NUM_THREADS` says how many.
+    One thread for little work; as many as ever for more, or where `OMP_NUM_THREADS` is set.
 
-    :param n_macs: multiplications of the work
+    :param n_macs: number of multiplications in the work
     """
     n_threads = th.get_num_threads()
     if n_macs > ONE_THREADS_MACS or n_threads == 1 or "OMP_NUM_THREADS" in os.environ:
@@ -134,9 +134,10 @@ def total_memory(device: th.device) -> int:
 @contextlib.contextmanager
 def explain_out_of_memory(device: th.device, sizes: Callable[[], str], n_bytes: int = 0) -> Iterator[None]:
     """
-    :param device: where training runs
-    :param sizes: tells the settings that decide how much is needed
-    :param n_bytes: needed at least; more than the device has are refused before an operating system ends the process
+    :param device: device that training runs on
+    :param sizes: function that tells the settings that decide how much is needed
+    :param n_bytes: memory needed at least, bytes; more than the device has is refused before an operating system ends the
+        process
     :raises MemoryError: in place of any error of memory, with these settings
     """
     there = total_memory(device)
@@ -156,9 +157,9 @@ def explain_out_of_memory(device: th.device, sizes: Callable[[], str], n_bytes: 
 
 def check_finite(means: dict[str, float], where: Callable[[], str], last_saved: str | None) -> None:
     """
-    :param means: of what is logged, by name
-    :param where: names the gradient steps
-    :param last_saved: the last checkpoint
+    :param means: means of the logged values, by name
+    :param where: function that names the gradient steps
+    :param last_saved: path of the last checkpoint; None if there is none
     :raises FloatingPointError: one of `FINITE` is not finite
     """
     for name in FINITE:
@@ -174,7 +175,8 @@ class RunningMeans:
     """
     Means of scalars, summed on their device: reading each value would wait for it.
 
-    :param sums: of :meth:`sums` and `n_values`, to go on from
+    :param sums: sums of earlier values to go on from, as :meth:`sums` returns them; none by default
+    :param n_values: number of earlier values in each sum
     """
 
     def __init__(self, sums: dict[str, float] | None = None, n_values: int = 0) -> None:
@@ -213,19 +215,19 @@ def step_seed(seed: int, n_updates: int, *purpose: int) -> int:
 
     Each step has a seed of its own, so that a run that was interrupted goes on as if it had not been.
 
-    :param seed: of the run
+    :param seed: seed of the run
     :param n_updates: gradient steps that the model has had
-    :param purpose: one of `BATCHES` and those beside it, and the process where each draws its own
+    :param purpose: `BATCHES` or one of the constants beside it, and the process's number where each process draws its own
     """
     return int(np.random.SeedSequence([seed, n_updates, *purpose]).generate_state(1, np.uint64)[0])
 
 
 def seed_default_generator(device: th.device, seed: int) -> None:
     """
-    Seed what dropout draws from; `torch.manual_seed` takes a thousand times as long.
+    Seed the generator that dropout draws from; `torch.manual_seed` takes a thousand times as long.
 
-    :param device: of the network
-    :param seed: any
+    :param device: device of the network
+    :param seed: new seed
     """
     if device.type == "cuda":
         th.cuda.manual_seed(seed)

@@ -36,8 +36,8 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
 
     A fall terminates an episode. Everything random comes from `np_random`: a seed repeats an episode exactly.
 
-    :param model_file: another's model of the robot, which :class:`~sb3_dtfm.envs.go1.second.MotorSimulation` drives; this
-        package's own by default
+    :param model_file: path of another model of the robot, which :class:`~sb3_dtfm.envs.go1.second.MotorSimulation` drives;
+        this package's own model by default
     :param randomize: draw another robot for each episode, add noise to sensors, and push the robot
     :param render_mode: None or "rgb_array"
     :param width: width of `rgb_array` frames, pixels
@@ -137,10 +137,10 @@ class Go1Env(gym.Env[np.ndarray, np.ndarray]):
 
 def observation_of(motion: Motion, last_action: np.ndarray, command: np.ndarray) -> np.ndarray:
     """
-    :param motion: as measured
+    :param motion: motion as the sensors measure it
     :param last_action: (12,)
-    :param command: (3,)
-    :return: what a policy sees, (45,) float32
+    :param command: forward and left in m/s, turn in rad/s, (3,)
+    :return: observation of a policy, (45,) float32
     """
     parts = (motion.gyro, motion.gravity, motion.joint_positions - HOME, motion.joint_velocities, last_action, command)
     return np.concatenate(parts).astype(np.float32)

@@ -36,9 +36,9 @@ class Link(NamedTuple):
     """
     A link, of the front left leg where it belongs to a leg.
 
-    :param position: of its frame in its parent's, metres
-    :param mass: kg
-    :param centre: of mass in its frame, metres
+    :param position: position of its frame in its parent's, metres
+    :param mass: mass, kg
+    :param centre: centre of mass in its frame, metres
     :param inertia: about its centre of mass: xx, yy, zz, xy, xz, yz, kg m^2
     :param mirrored: axes along which the other legs' links mirror mass and inertia: x at the rear, y on the right
     :param geometry: shape and its size, for pictures
@@ -96,8 +96,8 @@ def build_spec(legs: Sequence[str] = LEGS) -> mujoco.MjSpec:
     """
     The robot on a floor, with position servos. As in MuJoCo Playground, only its feet touch the floor.
 
-    :param legs: their order, and so that of joints and actuators; by default that of :data:`JOINT_NAMES`
-    :return: to be compiled
+    :param legs: order of the legs, and so of joints and actuators; by default that of :data:`JOINT_NAMES`
+    :return: specification, to be compiled
     """
     spec = mujoco.MjSpec()
     spec.modelname, spec.compiler.degree = "go1", False
@@ -115,8 +115,8 @@ def add_floor(spec: mujoco.MjSpec, priority: int = 0) -> None:
     """
     A plane and a light.
 
-    :param spec: of the scene
-    :param priority: of the floor's contact parameters over those of the feet
+    :param spec: specification of the scene
+    :param priority: priority of the floor's contact parameters over those of the feet
     """
     kind, size = mujoco.mjtGeom.mjGEOM_PLANE, [0.0, 0.0, 0.05]
     spec.worldbody.add_geom(

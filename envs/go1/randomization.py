@@ -13,14 +13,14 @@ class Draw(NamedTuple):
     """
     A robot and its floor.
 
-    :param friction: of floor and feet
+    :param friction: friction of floor and feet
     :param joint_friction: factors of the joints' static friction, (12,)
-    :param armature: factors of the joints', (12,)
-    :param mass: factors of the links', (13,), trunk first
-    :param payload: on the trunk, kg
+    :param armature: factors of the joints' armature, (12,)
+    :param mass: factors of the links' masses, (13,), trunk first
+    :param payload: mass added to the trunk, kg
     :param centre: shift of the trunk's centre of mass, (3,) metres
-    :param joint_zero: what the joints read where they should read 0, (12,) rad
-    :param delay: until a target arrives, as a share of a decision's time
+    :param joint_zero: readings of the joints where they should read 0, (12,) rad
+    :param delay: time until a target arrives, as a share of a decision's time
     :param strength: factors of the motors' torques, (12,); of our servos, only of the part that Kp makes
     """
 
@@ -47,7 +47,7 @@ RANGES: dict[str, tuple[float, float, tuple[int, ...]]] = {
     "delay": (0.0, 1.0, ()),
     "strength": (0.9, 1.1, (12,)),
 }
-# Largest deviation of what is measured.
+# Largest deviation of each measurement.
 NOISE = {"velocity": 0.1, "gyro": 0.2, "gravity": 0.05, "joint_positions": 0.03, "joint_velocities": 1.5}
 PUSH_SPEED = (0.0, 0.5)  # by which a push changes the trunk's velocity, m/s
 PUSH_INTERVAL = (3.0, 8.0)  # seconds between pushes
@@ -73,9 +73,9 @@ def draw_push(rng: np.random.Generator) -> tuple[np.ndarray, float]:
 
 def add_noise(motion: Motion, rng: np.random.Generator) -> Motion:
     """
-    :param motion: as it is
+    :param motion: true motion
     :param rng: source of randomness
-    :return: as the sensors measure it
+    :return: motion as the sensors measure it
     """
     return motion._replace(
         **{
@@ -89,7 +89,7 @@ class Randomizer:
     """
     Gives a simulation the robot that was drawn.
 
-    :param simulation: with the robot as it was made
+    :param simulation: simulation of the robot as it was made
     """
 
     FIELDS = (
@@ -107,7 +107,7 @@ class Randomizer:
 
     def apply(self, draw: Draw) -> None:
         """
-        :param draw: instead of the last one
+        :param draw: robot and floor that replace the last ones
         """
         model, made, links, trunk = self._model, self._made, self._links, self._links[0]
         dofs, positions = model.jnt_dofadr[self._joints], model.jnt_qposadr[self._joints]

@@ -12,9 +12,9 @@ class Camera:
     """
     Follows the trunk.
 
-    :param simulation: to be seen
-    :param width: pixels
-    :param height: pixels
+    :param simulation: simulation to render
+    :param width: width of the pictures, pixels
+    :param height: height of the pictures, pixels
     """
 
     def __init__(self, simulation: Simulation, width: int, height: int) -> None:

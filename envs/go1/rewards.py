@@ -19,10 +19,10 @@ class Step(NamedTuple):
     """
     A step as its reward sees it.
 
-    :param motion: after the step
+    :param motion: motion after the step
     :param action: (12,)
-    :param last_action: of the step before, (12,)
-    :param command: forward and left in m/s, turn in rad/s, (3,)
+    :param last_action: action of the step before, (12,)
+    :param command: commanded velocities: forward and left in m/s, turn in rad/s, (3,)
     """
 
     motion: Motion
@@ -42,8 +42,8 @@ class Step(NamedTuple):
 
 def beyond_limits(positions: np.ndarray) -> float:
     """
-    :param positions: of the joints, (12,) rad
-    :return: by how much they are beyond their soft limits, summed, rad
+    :param positions: positions of the joints, (12,) rad
+    :return: sum of the angles by which they are beyond their soft limits, rad
     """
     low, high = (SOFT_LIMIT * JOINT_LIMITS).T
     return float(np.sum(np.maximum(low - positions, 0.0) + np.maximum(positions - high, 0.0)))
@@ -73,15 +73,15 @@ REWARDS: dict[str, tuple[float, Callable[[Step], float]]] = {
 
 def reward_terms(step: Step) -> dict[str, float]:
     """
-    :param step: to be rewarded
-    :return: each term with its weight, by name
+    :param step: step to reward
+    :return: weighted terms by name
     """
     return {name: float(weight * term(step)) for name, (weight, term) in REWARDS.items()}
 
 
 def total_reward(terms: dict[str, float]) -> float:
     """
-    :param terms: of a step
-    :return: their sum over the time of a decision, and not below 0, so that no robot gains by falling soon
+    :param terms: weighted terms of a step, by name
+    :return: sum of the terms over the time of a decision, and not below 0, so that no robot gains by falling soon
     """
     return max(0.0, DECISION * sum(terms.values()))

@@ -17,16 +17,16 @@ class Motion(NamedTuple):
     """
     The robot's present motion.
 
-    :param velocity: of the IMU in the trunk's frame, (3,) m/s
+    :param velocity: velocity of the IMU in the trunk's frame, (3,) m/s
     :param gyro: turn rates in the trunk's frame, (3,) rad/s
-    :param gravity: its direction in the trunk's frame, (3,)
+    :param gravity: direction of gravity in the trunk's frame, (3,)
     :param joint_positions: (12,) rad
     :param joint_velocities: (12,) rad/s
     :param torques: (12,) N m
-    :param height: of the trunk, metres
-    :param foot_heights: of the feet's centres, (4,) metres
-    :param foot_speeds: along the floor, (4,) m/s
-    :param foot_contacts: whether they touch something, (4,)
+    :param height: height of the trunk, metres
+    :param foot_heights: heights of the feet's centres, (4,) metres
+    :param foot_speeds: speeds of the feet along the floor, (4,) m/s
+    :param foot_contacts: whether each foot touches something, (4,)
     """
 
     velocity: np.ndarray
@@ -54,7 +54,7 @@ class Simulation:
     """
     The robot with position servos.
 
-    :param model: with the names of :func:`~sb3_dtfm.envs.go1.model.build_spec`, in any order
+    :param model: MuJoCo model with the names of :func:`~sb3_dtfm.envs.go1.model.build_spec`, in any order
     """
 
     is_delay_fixed = False
@@ -82,9 +82,9 @@ class Simulation:
         Start anew above the floor's centre.
 
         :param joint_positions: (12,) rad
-        :param height: of the trunk, metres
-        :param yaw: of the trunk, rad
-        :param velocity: of the trunk, linear in the world's frame and angular in its own, (6,); none by default
+        :param height: height of the trunk, metres
+        :param yaw: yaw of the trunk, rad
+        :param velocity: velocity of the trunk, linear in the world's frame and angular in its own, (6,); none by default
         """
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:7] = (0.0, 0.0, height, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
@@ -97,7 +97,7 @@ class Simulation:
         """
         Simulate the time of a decision.
 
-        :param targets: of the joints, (12,) rad; until the delay is over, the last ones hold
+        :param targets: target positions of the joints, (12,) rad; until the delay is over, the last ones hold
         """
         for step in range(self.n_steps):
             self.drive(self._targets if step < self.delay else targets)
@@ -110,7 +110,7 @@ class Simulation:
         """
         Tell the actuators, before each physics step.
 
-        :param targets: of the joints, (12,) rad
+        :param targets: target positions of the joints, (12,) rad
         """
         self.data.ctrl[self.actuators] = targets
 
@@ -118,7 +118,7 @@ class Simulation:
         """
         Change the trunk's velocity at once.
 
-        :param velocity: to add along the floor, (2,) m/s
+        :param velocity: velocity to add along the floor, (2,) m/s
         """
         self.data.qvel[:2] += velocity
         mujoco.mj_step1(self.model, self.data)

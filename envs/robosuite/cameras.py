@@ -15,12 +15,12 @@ class Cameras:
     robomimic's files (robosuite's own are upside down), and without shadows and reflections, which take most of the time
     where no GPU draws.
 
-    :ivar close: frees what draws
+    :ivar close: function that frees the renderer
     :ivar images: the newest ones, (size, size, 3) uint8 by key
 
-    :param model: MuJoCo's
-    :param names: of cameras
-    :param size: height and width, pixels
+    :param model: MuJoCo model
+    :param names: names of the cameras
+    :param size: height and width of the images, pixels
     :raises ValueError: no such camera, or a size below 1
     :raises RuntimeError: nothing can be drawn on this machine as it is set up
     """
@@ -52,8 +52,8 @@ class Cameras:
 
     def __call__(self, data: Any) -> dict[str, np.ndarray]:
         """
-        :param data: MuJoCo's, of the state to draw
-        :return: (size, size, 3) uint8 by key
+        :param data: MuJoCo data of the state to draw
+        :return: images (size, size, 3) uint8 by key
         """
         import mujoco
 

@@ -34,16 +34,16 @@ class RobosuiteEnv(gym.Env[Any, np.ndarray]):
 
     For `render_mode="rgb_array"` on a machine without display, set `MUJOCO_GL` to `egl` or `osmesa` beforehand.
 
-    :param task: a key of :data:`~sb3_dtfm.envs.robosuite.TASKS`
+    :param task: name of the task, a key of :data:`~sb3_dtfm.envs.robosuite.TASKS`
     :param horizon: steps after which an unsolved episode is truncated; the task's own, 400 for most, if not given
     :param render_mode: None, "rgb_array" or "human"
     :param controller_config: robosuite 1.5 composite controller, or a single-arm controller of robosuite <= 1.4;
         robosuite's default for the Panda if not given
     :param lite_physics: robosuite's faster stepping (one forward pass per physics step); same dynamics
-    :param cameras: observed ones, such as "agentview" and "robot0_eye_in_hand": the observation is a Dict then, of their
-        images and of the arm's own numbers, by robomimic's names
+    :param cameras: names of the observed cameras, such as "agentview" and "robot0_eye_in_hand": the observation is a Dict
+        then, of their images and of the arm's own numbers, by robomimic's names
     :param camera_size: height and width of these images, pixels
-    :param object_state: observe `object`, too; not given, only without cameras
+    :param object_state: whether `object` is observed, too; by default only without cameras
     :param camera_name: camera of `rgb_array` frames
     :param width: width of `rgb_array` frames, pixels
     :param height: height of `rgb_array` frames, pixels
@@ -177,7 +177,7 @@ class RobosuiteEnv(gym.Env[Any, np.ndarray]):
         """
         Choose whether the next steps draw what cameras see, which takes most of a step. For a caller who does not look.
 
-        :param wanted: otherwise steps return the images that were drawn last; a reset draws always
+        :param wanted: whether they draw; otherwise steps return the images that were drawn last; a reset draws always
         """
         self._draws_images = wanted
 

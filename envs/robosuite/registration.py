@@ -44,7 +44,7 @@ def env_id_from_robomimic(env_args: str | dict[str, Any]) -> str | None:
     Gymnasium id of the task of a robomimic file.
 
     :param env_args: the `env_args` attribute of the file's `data` group
-    :return: such as "robosuite/Lift-v0"; None for a task that is not one of ours
+    :return: id such as "robosuite/Lift-v0"; None for a task that is not one of ours
     """
     task, _ = _parsed(env_args)
     return None if task is None else _env_id(task)
@@ -81,10 +81,10 @@ def differences_from_robomimic(
     """
     Compare how actions move the arm in a robomimic file and in an environment of ours.
 
-    :param env_args: as for :func:`env_id_from_robomimic`
+    :param env_args: see :func:`env_id_from_robomimic`
     :param ours: `RobosuiteEnv.env_args` of the environment; by default a registered one
-    :return: by the name of each field that differs, its value in the file and ours; a field that is missing counts as that
-        of a registered environment
+    :return: value in the file and our value of each field that differs, by name; a field that is missing counts as that of
+        a registered environment
     """
     return differences_in_motion(arm_motion(env_args), arm_motion(ours or {}))
 
@@ -93,9 +93,9 @@ def differences_in_motion(motion: dict[str, Any], ours: dict[str, Any]) -> dict[
     """
     Compare what actions do, as :func:`arm_motion` has it.
 
-    :param motion: of the data; plain values of any kind
-    :param ours: of an environment
-    :return: by the name of each field that differs, its two values
+    :param motion: motion settings of the data; plain values of any kind
+    :param ours: motion settings of an environment
+    :return: both values of each field that differs, by name
     """
     pairs = {name: (motion.get(name, own), own) for name, own in ours.items()}
     return {name: pair for name, pair in pairs.items() if not _alike(*pair)}
@@ -112,8 +112,8 @@ def arm_motion(env_args: str | dict[str, Any]) -> dict[str, Any]:
     """
     Robot, controller and control frequency, on which the effect of an action depends, by robosuite's names.
 
-    :param env_args: as for :func:`env_id_from_robomimic`
-    :return: plain values; a field that is missing is that of a registered environment
+    :param env_args: see :func:`env_id_from_robomimic`
+    :return: plain values by name; a field that is missing is that of a registered environment
     """
     kwargs = _parsed(env_args)[1].get("env_kwargs", {})
     arm, robots = arm_controller(kwargs), kwargs.get("robots", "Panda")
@@ -126,8 +126,8 @@ def arm_controller(env_kwargs: dict[str, Any]) -> dict[str, Any]:
     """
     The settings of the arm's controller.
 
-    :param env_kwargs: of a robomimic file's `env_args`
-    :return: those of robosuite 1.5, or of robosuite <= 1.4; empty where the file has none
+    :param env_kwargs: `env_kwargs` of a robomimic file's `env_args`
+    :return: settings of robosuite 1.5, or of robosuite <= 1.4; empty where the file has none
     """
     config = env_kwargs.get("controller_configs") or {}
     config = config[0] if isinstance(config, list) else config

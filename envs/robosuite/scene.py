@@ -80,7 +80,7 @@ def make_robosuite(environment: str, controller_config: dict[str, Any] | None, l
     robosuite's own environment, without cameras, renderer and horizon.
 
     :param environment: robosuite's name of the task
-    :param controller_config: of robosuite 1.5 or <= 1.4; robosuite's default for the Panda if not given
+    :param controller_config: controller settings of robosuite 1.5 or <= 1.4; robosuite's default for the Panda if not given
     :param lite_physics: see :class:`~sb3_dtfm.envs.robosuite.RobosuiteEnv`
     """
     robosuite = import_robosuite()
@@ -111,7 +111,7 @@ def scene_xml(env: Any, variation: "SceneVariation | None") -> str:
     MuJoCo XML of a scene as it is at present; asset paths start at robosuite's package, as robomimic expects.
 
     :param env: robosuite's environment
-    :param variation: what episodes change in this scene
+    :param variation: differences between episodes in this scene; None if there are none
     """
     package = os.path.dirname(import_robosuite().__file__ or "")
     xml = re.sub(r'file="' + re.escape(package), 'file="robosuite', env.edit_model_xml(env.model.get_xml()))
@@ -170,7 +170,7 @@ class BodyPoses(SceneVariation):
     """
     Bodies without a joint, which robosuite's reset puts elsewhere in the compiled scene.
 
-    :param names: of the bodies
+    :param names: names of the bodies
     """
 
     def __init__(self, *names: str) -> None:

@@ -41,11 +41,11 @@ class RobosuiteTask:
 
     Its objects are observed as robosuite's `object-state`, and robosuite draws their places.
 
-    :param environment: robosuite's name
+    :param environment: robosuite's name of the task
     :param horizon: steps after which an unsolved episode is truncated: robomimic's, or 400 for each object to move
-    :param variation: what one episode's scene has otherwise than another's, beside its state
-    :param is_solved: from robosuite's environment after a step
-    :param demonstrator: who shows how it is done
+    :param variation: differences between episodes' scenes, beside their states; None if there are none
+    :param is_solved: function that tells from robosuite's environment after a step whether the task is solved
+    :param demonstrator: class of the scripted demonstrator; None if there is none
     """
 
     environment: str

@@ -37,9 +37,9 @@ class Arrays(ABC):
     """
     Arrays by name, none of which is read before it has been looked at.
 
-    :param source: what they are called, for messages
-    :param names: of all that are there
-    :param n_stored: bytes of the file, None in memory
+    :param source: name of their source, for messages
+    :param names: names of all arrays
+    :param n_stored: size of the file, bytes; None in memory
     """
 
     # Whether each is a column of a table, (N,), several of which make up an observation.
@@ -69,14 +69,15 @@ class Arrays(ABC):
         raise DatasetError(f"{self.source}: has no array {accepted}, only {found}.{cure}")
 
     def beginning(self, name: str) -> list[str]:
-        """The columns of a table that begin with a name, but the next step's."""
+        """The columns of a table that begin with a name, except those of the next step."""
         following = rf"{name}[\W_]+next([\W_]|$)"
         return [each for each in self.names if re.match(rf"{name}[\W_\d]", each) and not re.match(following, each)]
 
     def columns(self, names: Sequence[str]) -> list[str]:
         """
-        The columns of a table that begin with the first of the names that any begins with, as `obs.x` and `obs.y`, but the
-        next step's. If there are some with nothing but numbers behind it, as `obs_0` or `obs[0]`, those alone.
+        The columns of a table that begin with the first of the names that fits any column, such as `obs.x` and `obs.y`,
+        except those of the next step. If some have nothing but numbers behind the name, such as `obs_0` or `obs[0]`, those
+        alone.
         """
         if self.are_columns and not self.has(names):
             for name in names:

@@ -12,7 +12,7 @@ def import_pyarrow(source: str) -> ModuleType:
     """
     The package, with `compute`, `dataset`, `parquet` and `types`.
 
-    :param source: what is to be read, for the message
+    :param source: name of the file or dataset to read, for the message
     :raises ImportError: not installed; says which extra installs it
     """
     try:

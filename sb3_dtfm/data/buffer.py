@@ -26,7 +26,7 @@ from sb3_dtfm.windows import OBSERVATION, map_tensors
 
 # A buffer moves to an accelerator if it takes at most this share of the memory that is free there.
 DEVICE_MEMORY_SHARE = 0.5
-# How the names of image arrays in a file of flat arrays begin.
+# Prefix of the names of image arrays in a file of flat arrays.
 IMAGE = "image:"
 
 
@@ -51,7 +51,7 @@ class TrajectoryBuffer(FlatSteps):
     :ivar returns_to_go: (N,) float32, environment reward units
     :ivar image_spaces: spaces of the images, uint8 as they were recorded, by camera; the images themselves are `own(camera)`
     :ivar episodes: the buffer's episodes, one row each
-    :ivar weights: (E,) float64, how often a step of each is drawn beside one of weight 1
+    :ivar weights: (E,) float64, relative sampling weight of each episode's steps
     :ivar env_id: Gymnasium id of the environment that they come from, None if unknown
     :ivar controller: robot, controller and control frequency that the actions were recorded with, by robosuite's names;
         None where the data do not tell
@@ -111,11 +111,11 @@ class TrajectoryBuffer(FlatSteps):
         :param action_space: bounded Box of floats of shape (A,), or Discrete
         :param observation_space: Box of shape (O,); unbounded with the first episode's O if not given
         :param n_steps: steps of all episodes, where known beforehand, so that memory for them is taken once
-        :param source: where the episodes come from, for messages
+        :param source: origin of the episodes, for messages
         :param score_reference: scale of the normalised score
         :param env_id: Gymnasium id of the environment that the episodes come from
         :param storage: storage of the steps; memory if not given
-        :param on_invalid: "raise" for an episode that is refused, or "drop" it, which is counted and warned of
+        :param on_invalid: "raise" an error for an invalid episode, or "drop" it, which is counted and warned of
         :param n_stored: bytes of the files that the episodes are read from; episodes that take far more are refused before
             they fill the memory, see :func:`~sb3_dtfm.data.trajectories.check_size`
         :raises DatasetError: nothing to learn from, other spaces, wrong shapes, NaN or infinity, or actions outside of
@@ -206,7 +206,7 @@ class TrajectoryBuffer(FlatSteps):
 
         :param n_steps: n, steps whose rewards count as they came
         :param seed: seed of the network that learns what to expect; an equal one gives equal numbers
-        :return: on the same flat tensors, but for the returns-to-go
+        :return: buffer on the same flat tensors, but with its own returns-to-go
         """
         rows, timesteps, n_left = self._locate(th.arange(len(self), device=self._stops.device))
         steps = Steps(self.stored["observations"], self.stored["returns_to_go"], rows, timesteps, n_left)
@@ -218,12 +218,12 @@ class TrajectoryBuffer(FlatSteps):
 
     def within(self, max_episode_steps: int) -> "TrajectoryBuffer":
         """
-        A buffer of what an environment with such a time limit would have shown: of longer episodes the first steps, which
-        count as truncated, and returns of these. Whether one that succeeded had by then, the data do not tell; one that
-        did not had not.
+        A buffer of what an environment with such a time limit would have shown: longer episodes are cut after
+        `max_episode_steps`, count as truncated, and have the return of the steps that are left. The data do not tell
+        whether a successful episode had succeeded by then; an unsuccessful one had not.
 
         :param max_episode_steps: steps of an episode, at least 1
-        :return: on the same flat tensors, but for the returns-to-go; the buffer itself where no episode is longer
+        :return: buffer on the same flat tensors, but with its own returns-to-go; this buffer where no episode is longer
         :raises ValueError: `max_episode_steps` below 1
         """
         check_arguments({"max_episode_steps": max_episode_steps}, {"max_episode_steps": COUNT})
@@ -257,7 +257,7 @@ class TrajectoryBuffer(FlatSteps):
         Largest absolute discounted return-to-go, over the buffer's own episodes; reads 4 bytes a step.
 
         :param gamma: discount of a step
-        :return: environment reward units
+        :return: largest absolute value, environment reward units
         """
         largest = 0.0
         for start, length in zip(self.episodes.starts, self.episodes.lengths, strict=True):
@@ -352,7 +352,7 @@ class TrajectoryBuffer(FlatSteps):
         A buffer of some of the episodes, in the order given, on the same flat tensors.
 
         :param episodes: (E',) episode indices, at least one
-        :raises ValueError: none
+        :raises ValueError: no episode
         """
         if not len(episodes):
             raise ValueError(f"{self.source}: select was given no episode; at least one of {self.n_episodes} is needed.")
@@ -369,7 +369,7 @@ class TrajectoryBuffer(FlatSteps):
 
         :param min_return: the smallest return that is kept, environment reward units; None keeps all
         :param best_share: share of the episodes in (0, 1], those of the largest returns; at least one is kept
-        :param success_only: keep the successes, of which the best share is then taken
+        :param success_only: whether to keep only successes, of which the best share is then taken
         :raises DatasetError: no episode has such a return, none is a success, or the data do not tell
         :raises ValueError: `best_share` outside of (0, 1]
         """
@@ -401,8 +401,8 @@ class TrajectoryBuffer(FlatSteps):
         """
         One buffer, in memory, of the episodes of several, one after the other.
 
-        :param buffers: of one task, at least one
-        :param weights: how often a step of each is drawn beside one of weight 1
+        :param buffers: buffers of one task, at least one
+        :param weights: relative sampling weight of the steps of each buffer
         :raises DatasetError: other observations, actions or environments than the first one's
         """
         first, source = buffers[0], " + ".join(buffer.source for buffer in buffers)

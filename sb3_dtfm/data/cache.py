@@ -39,8 +39,8 @@ def existing_file(path: str | os.PathLike[str], expected: str) -> Path:
     """
     The path of a dataset's file.
 
-    :param path: `~` is the home folder
-    :param expected: what it should be, for the message
+    :param path: path of the file; `~` is the home folder
+    :param expected: description of the expected file, for the message
     :raises DatasetError: no such file
     """
     path = Path(path).expanduser()
@@ -54,8 +54,8 @@ def files_below(folder: Path, part: str = "") -> list[Path]:
     """
     All files in a part of a folder and below it, behind links within the folder, too, sorted.
 
-    :param folder: of a dataset; a snapshot of Hugging Face's hub may link to the hub's `blobs`
-    :param part: what to look through, the whole folder if not given
+    :param folder: folder of a dataset; a snapshot of Hugging Face's hub may link to the hub's `blobs`
+    :param part: path of the part, relative to the folder; the whole folder by default
     :raises DatasetError: a link leads out of the folder, to anything on this machine, or a pipe or device lies in it
     """
     root, files, seen = folder.resolve(), [], set()
@@ -86,9 +86,9 @@ class Fingerprint(NamedTuple):
     """
     Origin of a cache.
 
-    :param name: what the dataset is called
-    :param path: its file or folder
-    :param arguments: what was read of it
+    :param name: name of the dataset
+    :param path: file or folder of the dataset
+    :param arguments: arguments of the reader, as JSON
     :param state: digest of names, sizes and modification times of its files
     """
 
@@ -102,9 +102,9 @@ class Fingerprint(NamedTuple):
         """
         Take the fingerprint of a dataset as it is now.
 
-        :param name: what it is called, for its cache's folder and messages
-        :param path: its file, or the folder that holds its files
-        :param arguments: of the reader, as JSON can hold them
+        :param name: name of the dataset, for its cache's folder and for messages
+        :param path: file of the dataset, or the folder that holds its files
+        :param arguments: arguments of the reader, values that JSON can hold
         """
         path = path.resolve()
         files = [path] if path.is_file() else files_below(path)
@@ -113,7 +113,7 @@ class Fingerprint(NamedTuple):
 
     @property
     def folder_name(self) -> str:
-        """One for each dataset and choice from it, so that a changed dataset takes the place of the old one."""
+        """One name for each dataset and arguments of its reader, so that a changed dataset's cache replaces the old one."""
         name = re.sub(r"[^\w.-]+", "-", self.name)
         return f"{name}-{_digest([self.path, self.arguments])[:16]}"
 
@@ -132,8 +132,8 @@ def load_cached(
     what it leaves.
 
     :param cache_dir: folder of caches, made if necessary
-    :param fingerprint: of the dataset as it is now
-    :param read: fills the storage that it is given
+    :param fingerprint: fingerprint of the dataset as it is now
+    :param read: function that reads the dataset into a storage, and returns the buffer
     :raises DatasetError: the dataset cannot be read, or the cache cannot be written or is damaged
     """
     folder = cache_dir / fingerprint.folder_name
@@ -218,7 +218,7 @@ def open_cache(folder: Path) -> TrajectoryBuffer:
     """
     A buffer whose steps are memory-mapped.
 
-    :param folder: of one cache
+    :param folder: folder of the cache
     :raises DatasetError: the cache is damaged or incomplete
     """
     description = _read_description(folder)
@@ -274,8 +274,8 @@ def _check_members(folder: Path, digests: dict[str, str]) -> concurrent.futures.
     """
     Compare files with what was written, once in a process: at once, or one after the other in the background if large.
 
-    :param digests: of each file, by its name
-    :return: what is still going on, and will hold the error if there is one
+    :param digests: SHA-256 digest of each file, by file name
+    :return: future of the checks in the background, which holds their error if there is one; None if there are none
     :raises DatasetError: a small file is missing or holds other bytes
     """
     large = []

@@ -39,10 +39,10 @@ def collect(
     """
     Arguments are those of :meth:`TrajectoryBuffer.from_trajectories`.
 
-    :param trajectories: or short episodes, many together
+    :param trajectories: episodes, or many short ones together
     :return: the flat tensors, a row for each episode, the observation space, those of images by camera, and what the buffer
         tells of dropped episodes
-    :raises DatasetError: as there
+    :raises DatasetError: see there
     """
     if on_invalid not in ON_INVALID:
         raise DatasetError(f"on_invalid must be one of {', '.join(ON_INVALID)}, got {on_invalid!r}.")
@@ -105,7 +105,7 @@ def _checked(
     Episodes that pass a check, each with what the check made of it; short ones together, or one by one where they do not
     pass together.
 
-    :param dropped: gets the reason for each other one, where `on_invalid` is "drop"
+    :param dropped: list that receives the error of each other episode, where `on_invalid` is "drop"
     """
     iterator = iter(trajectories)
     while True:

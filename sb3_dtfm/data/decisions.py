@@ -37,7 +37,7 @@ DECIDED = frozenset(
 class Decision(NamedTuple):
     """
     :param name: argument of the algorithm or the policy
-    :param value: what it is set to
+    :param value: value that the argument is set to
     :param reason: the measurement, as a sentence
     """
 
@@ -50,7 +50,7 @@ def decide(buffer: TrajectoryBuffer) -> list[Decision]:
     """
     Settings that differ between kinds of data.
 
-    :param buffer: what is learned from
+    :param buffer: recorded episodes to learn from
     """
     errors = prediction_errors(buffer)
     by_return = _by_return(errors)
@@ -66,9 +66,9 @@ def decide_open(buffer: TrajectoryBuffer, names: set[str], given: Mapping[str, A
     """
     The decisions that a user has left open.
 
-    :param buffer: what is learned from
-    :param names: of the settings that there are
-    :param given: settings by the user, which also rule out decisions about others
+    :param buffer: recorded episodes to learn from
+    :param names: names of the available settings
+    :param given: settings that the user gave, by name, which also rule out decisions about others
     """
     names = names - set(given)
     if given.get("flow_steps") == 0:  # the mean action, which a regression learns

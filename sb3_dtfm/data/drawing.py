@@ -20,9 +20,9 @@ class FlatSteps:
     """
     Steps of episodes in flat float32 tensors, drawn as windows that may end at any step.
 
-    :param tensors: (N, ...) for each of `STEP_ARRAYS`, and images by camera
-    :param episodes: the own ones, which need not be all that lie in the tensors
-    :param maps: the tensors that are files, of those that windows hold
+    :param tensors: tensors (N, ...) for each of `STEP_ARRAYS`, and images by camera
+    :param episodes: table of the buffer's own episodes, which need not be all that lie in the tensors
+    :param maps: memory-mapped arrays among those that windows read; empty in memory
     :ivar stored: the tensors, which buffers of other episodes share; the buffer's own steps lie at `rows`. To read them,
         take `observations`, `actions`, `rewards` and `returns_to_go`, which are the own ones alone
     """
@@ -108,12 +108,12 @@ class FlatSteps:
 
         :param batch_size: B
         :param context_length: K
-        :param generator: source of randomness, of nothing else: it is a batch ahead
+        :param generator: source of randomness for nothing else, since it is a batch ahead
         :param n_ahead: see :meth:`windows`
         :param return_weighting: w: a step of an episode of return R is drawn 1 + w (R - Rmin) / (Rmax - Rmin) times as often
             as one of the worst episode (Yue et al., 2022)
-        :param seeds: what `generator` is seeded with before it draws, one number a batch: where each is its own, a run that
-            goes on draws what it would have drawn. Without them the generator draws on
+        :param seeds: seeds of `generator`, one for each batch: a resumed run then draws what it would have drawn. Without
+            them the generator draws on
         """
         differ = return_weighting > 0 or (self.weights != self.weights[0]).any()
         weights = self._episode_weights(return_weighting).to(generator.device) if differ else None
@@ -145,7 +145,7 @@ class FlatSteps:
         return self.windows(self._draw(batch_size, generator), context_length)
 
     def _episode_weights(self, return_weighting: float) -> th.Tensor:
-        """(E,) float32, with what probability an episode is drawn, up to a factor: by its length, its weight, its return."""
+        """(E,) float32, probability of drawing each episode, up to a factor: by its length, its weight and its return."""
         returns = self.episodes.returns - self.episodes.returns.min()
         by_return = 1.0 + return_weighting * returns / (returns.max() or 1.0)
         return th.from_numpy(self.weights * self.episodes.lengths * by_return).float()
@@ -207,8 +207,8 @@ class FlatSteps:
         """
         Images by camera, (*shape, channels, height, width) uint8, of these rows of the stored tensors.
 
-        :param rows: (R,) int64
-        :param shape: of R numbers
+        :param rows: (R,) int64, rows of the stored tensors
+        :param shape: leading shape of the images, R in all
         """
         found = {camera: self.stored[camera].index_select(0, rows) for camera in self.cameras}
         return {camera: channels_first(image).unflatten(0, tuple(shape)) for camera, image in found.items()}

@@ -38,9 +38,10 @@ def read_ends(arrays: Arrays, n_steps: int, max_episode_steps: int | None) -> En
     """
     Find where episodes end, and how.
 
-    :param arrays: of the file
+    :param arrays: arrays of the file
     :param n_steps: N
-    :param max_episode_steps: of the environment, which cuts where terminations alone tell of ends
+    :param max_episode_steps: time limit of the environment, steps, after which episodes are cut where terminations alone
+        tell of ends; None cuts none
     :raises DatasetError: nothing tells of ends, or no such ends are possible
     """
     terminated, truncated, done = (_flags(arrays, names, n_steps) for names in (TERMINATIONS, TRUNCATIONS, DONES))
@@ -83,7 +84,7 @@ def _warn_of_inner_ends(ended: np.ndarray, stops: np.ndarray, arrays: Arrays) ->
 
 
 def _cut(stops: np.ndarray, max_episode_steps: int | None, arrays: Arrays) -> np.ndarray:
-    """Ends of episodes of which only terminations tell: those that ran out of time are joined to the next ones."""
+    """Ends of episodes that only terminations mark: cut after `max_episode_steps`, else joined where time ran out."""
     told = f"{arrays.source}: {arrays.name(TERMINATIONS)} tell of terminal states, and nothing tells of time-outs"
     if max_episode_steps is None:
         warn(

@@ -33,7 +33,7 @@ class Statistics(NamedTuple):
     def normalize(self, observations: th.Tensor) -> th.Tensor:
         """
         :param observations: (..., O)
-        :return: in standard deviations from the mean, clipped at 10; a dimension that is constant becomes zero
+        :return: (..., O), distances from the mean in standard deviations, clipped at 10; a constant dimension becomes zero
         """
         mean, std = (th.as_tensor(each, dtype=th.float32) for each in (self.observation_mean, self.observation_std))
         return ((observations - mean) / th.where(std > SMALLEST_STD, std, th.inf)).clamp(-CLIP, CLIP)

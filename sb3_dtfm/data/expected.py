@@ -24,7 +24,7 @@ class Steps(NamedTuple):
     :param returns_to_go: (N,)
     :param rows: (M,) int64
     :param timesteps: (M,) int64
-    :param n_left: (M,) int64, how many steps of the episode come after
+    :param n_left: (M,) int64, number of later steps in the episode
     """
 
     observations: th.Tensor
@@ -36,15 +36,15 @@ class Steps(NamedTuple):
 
 def expected_returns_to_go(steps: Steps, n_steps: int, statistics: Statistics, seed: int) -> th.Tensor:
     """
-    Returns-to-go of which what came after n steps is replaced by what may be expected there.
+    Returns-to-go whose part after n steps is replaced by the return that may be expected there.
 
     They are means of n-step returns (Sutton and Barto, 2018, section 7.1), of n to 2 n steps: what is expected at one
     observation differs from that at the next one by chance. A step with fewer than n to follow keeps what was recorded.
 
-    :param steps: what is learned from, and asked about
+    :param steps: steps to learn from and to predict for
     :param n_steps: n
-    :param statistics: of their observations
-    :param seed: of the regression
+    :param statistics: statistics of their observations
+    :param seed: seed of the regression
     :return: (M,) float32
     """
     returns_to_go = steps.returns_to_go[steps.rows]
@@ -64,9 +64,9 @@ def _regression(steps: Steps, statistics: Statistics, seed: int) -> th.Tensor:
     Few steps and weight decay keep it from learning episodes by heart; dropout would lift an expectile by the spread that it
     makes. Global random numbers stay as they are.
 
-    :param steps: what is learned from, and asked about
-    :param statistics: of their observations
-    :param seed: of weights and batches
+    :param steps: steps to learn from and to predict for
+    :param statistics: statistics of their observations
+    :param seed: seed of weights and batches
     :return: (M,) float32
     """
     scale = statistics.return_scale or 1.0

@@ -44,9 +44,9 @@ def warn_of_made_up_rewards(
     """
     Say what counts where there are no rewards, and which arrays may have been meant as rewards, or as ends.
 
-    :param names: of all arrays
-    :param source: for the message
-    :param missing: what the reader has looked for
+    :param names: names of all arrays
+    :param source: name of the data, for the message
+    :param missing: clause that says what is missing, for the message
     """
     names = set(names)
     if names & set(REWARDS):
@@ -94,7 +94,7 @@ def fingerprint_flat_file(path: str | os.PathLike[str], options: dict[str, Any])
     Take the fingerprint of a file as it is now.
 
     :param path: the file
-    :param options: of :func:`load_flat`
+    :param options: options of :func:`load_flat`
     :raises DatasetError: no such file
     """
     path = existing_file(path, EXPECTED)
@@ -105,7 +105,7 @@ def json_options(options: dict[str, Any]) -> dict[str, Any]:
     """
     Options of a reader as JSON can hold them: arrays become lists.
 
-    :param options: `action_bounds` or `action_space` among them
+    :param options: options by name, such as `action_bounds` or `action_space`
     """
     options = dict(options)
     space, observed = options.pop("action_space", None), options.pop("observation_space", None)
@@ -134,28 +134,30 @@ def load_flat(
     """
     Episodes one after the other in flat arrays of N steps: as `numpy.savez` writes them, in D4RL's hdf5 files, or in memory.
 
-    Read are `observations` (N, O), `actions` (N, A), or whole numbers (N,) of a Discrete space, and `rewards` (N,), or what
-    others call them (`obs`, `state`, `action`, `reward`). Episodes end where `episode_ends` says (E,), counting steps from
-    the start of the file, or after `episode_lengths` (E,) each, or where `episode` (N,) changes, or at the steps of
-    `terminals`, `timeouts` or `dones` (N,). If only `terminals` tell of ends, episodes are cut after every
-    `max_episode_steps`. `success` tells of each episode (E,), NaN of one that is not known, or of each step (N,), and then
-    an episode's last one counts. Without rewards a success has a reward of 1 at its last step, and an episode of which
-    nothing tells is one.
+    The arrays are `observations` (N, O), `actions` (N, A), or whole numbers (N,) of a Discrete space, and `rewards` (N,), or
+    have the names of others (`obs`, `state`, `action`, `reward`). Episodes end where `episode_ends` says (E,), counting
+    steps from the start of the file, or after `episode_lengths` (E,) each, or where `episode` (N,) changes, or at the steps
+    of `terminals`, `timeouts` or `dones` (N,). If only `terminals` tell of ends, episodes are cut after every
+    `max_episode_steps`. `success` tells of each episode (E,), NaN where it is unknown, or of each step (N,), and then an
+    episode's last one counts. Without rewards a success has a reward of 1 at its last step, and an episode whose success is
+    unknown counts as one.
 
     A table has a row for each step and a column for each number; columns that begin with `obs`, such as `obs_0`, make up the
     observation. Nothing in a file is ever executed: arrays of Python objects are refused. The arrays are read into memory,
     also to write a cache of them.
 
     :param dataset: path of the file, arrays by name, or a DataFrame
-    :param observation_keys: which arrays make up the observation, in this order, each (N, ...); also entries of dictionary
-        observations. The default are the entries of the environment's Dict if each has an array of its name and size
-    :param action_keys: which arrays make up the action, in this order, each (N, ...)
+    :param observation_keys: names of the arrays that make up the observation, in this order, each (N, ...), or of entries
+        of dictionary observations. By default the entries of the environment's Dict, if each has an array of its name and
+        size
+    :param action_keys: names of the arrays that make up the action, in this order, each (N, ...)
     :param action_bounds: smallest and largest action that the environment accepts, numbers or (A,) each; where they are not
         given, a file's own `action_low` and `action_high`, or those of `action_space`, or -1 and 1. For Discrete actions
         the first and the last one
     :param clip_actions: bring actions outside of them to the nearest bound, however far, instead of refusing them
-    :param action_space: the environment's
-    :param observation_space: the environment's, which tells what is a choice, see :func:`~sb3_dtfm.data.load_dataset`
+    :param action_space: the environment's action space
+    :param observation_space: the environment's observation space, which tells what is a choice, see
+        :func:`~sb3_dtfm.data.load_dataset`
     :param max_episode_steps: time limit of the environment, steps
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
     :param storage: storage of the steps; memory if not given
@@ -311,7 +313,7 @@ def _observations(arrays: Arrays, keys: Sequence[str], n_steps: int, space: spac
 
 
 def _successes(arrays: Arrays, n_steps: int, stops: np.ndarray) -> np.ndarray:
-    """(E,): 1, 0, or NaN of an episode of which nothing tells."""
+    """(E,): 1, 0, or NaN for an episode of unknown success."""
     if not arrays.has(SUCCESSES):
         return np.full(len(stops), np.nan)
     array, where = np.atleast_1d(arrays.read(SUCCESSES)), f"{arrays.source}: {arrays.name(SUCCESSES)}"
@@ -326,8 +328,8 @@ def check_shape(actions: np.ndarray, space: ActionSpace | None, where: str) -> N
     Refuse what are no actions.
 
     :param actions: (N, A), or (N,) of Discrete ones
-    :param space: the environment's
-    :param where: whose they are, for messages
+    :param space: the environment's action space
+    :param where: origin of the actions, for messages
     :raises DatasetError: another shape, or no step
     """
     choices = actions.ndim == 1 and (isinstance(space, spaces.Discrete) or actions.dtype.kind in "iub")
@@ -343,10 +345,10 @@ def bounded_space(bounds: Sequence[Any] | None, space: ActionSpace | None, actio
     The action space of data that hold numbers alone.
 
     :param bounds: smallest and largest action, numbers or (A,) each
-    :param space: the environment's, where `bounds` are not given
-    :param actions: as :func:`check_shape` lets them pass
-    :param source: whose actions they are, for messages
-    :return: where neither is given, from -1 to 1
+    :param space: the environment's action space, where `bounds` are not given
+    :param actions: actions that :func:`check_shape` accepts
+    :param source: origin of the actions, for messages
+    :return: the action space; a Box from -1 to 1 where neither is given
     :raises DatasetError: `bounds` are something else, or the number of Discrete actions is unknown
     """
     if bounds is None and space is not None and (isinstance(space, spaces.Discrete) or space.shape == actions.shape[1:]):
@@ -375,9 +377,9 @@ def explain_range(space: ActionSpace, bounds: Sequence[Any] | None, environment:
     """
     Explain the default range of actions, and how to give another.
 
-    :param space: what the actions are learned as
-    :param bounds: that have been given, or None
-    :param environment: its action space, or None
+    :param space: action space that is learned
+    :param bounds: bounds that the user gave, or None
+    :param environment: the environment's action space, or None
     :raises DatasetError: an action lies outside of the space
     """
     try:
@@ -396,8 +398,8 @@ def fitted(actions: np.ndarray, space: ActionSpace, clip: bool) -> np.ndarray:
     Actions in the shape of their space, where they can be.
 
     :param actions: (T, A), (T,), or (T, 1) of Discrete ones
-    :param space: what they are to be learned as
-    :param clip: bring them into it; what is not finite stays, to be refused
+    :param space: action space that is learned
+    :param clip: whether to clip them to its bounds; numbers that are not finite stay, to be refused
     """
     if isinstance(space, spaces.Discrete) and actions.shape[1:] == (1,):
         actions = actions[:, 0]

@@ -30,8 +30,8 @@ def read_hdf5(group: h5py.Group, name: str, where: str) -> np.ndarray:
 
     Most of the time that `group[name][:]` takes goes into h5py's objects, so HDF5 is asked directly.
 
-    :param group: of the file that was opened
-    :param name: what the array is called there
+    :param group: group of an opened file
+    :param name: name of the array in the group
     :param where: the file and the episode, for messages
     :raises DatasetError: there is none, it holds no numbers, lies in another file, or is not there in full
     """
@@ -45,7 +45,7 @@ def read_hdf5(group: h5py.Group, name: str, where: str) -> np.ndarray:
 
 def read_images(group: h5py.Group, name: str, where: str) -> np.ndarray | h5py.Dataset:
     """
-    :param group: as for :func:`read_hdf5`, which says the rest too
+    :param group: see :func:`read_hdf5`, also for the parameters that follow
     :return: images as they are stored: an array, or the bytes of one file each, which are read one by one
     """
     data, _, dtype = open_hdf5(group, name, where, encoded=True)
@@ -58,7 +58,7 @@ def open_hdf5(
     """
     An array that may be read, its shape and its type.
 
-    :param group: as for :func:`read_hdf5`, which says the rest too
+    :param group: see :func:`read_hdf5`, also for the parameters that follow
     :param encoded: accept strings of bytes, too
     """
     what = f"{where}: {name}"
@@ -77,7 +77,7 @@ def read_names(group: h5py.Group, name: str, where: str) -> list[str]:
     """
     An array of names.
 
-    :param group: as for :func:`read_hdf5`, which says the rest too
+    :param group: see :func:`read_hdf5`, also for the parameters that follow
     """
     what = f"{where}: {name}"
     data, shape, dtype, n_stored = _opened(group, name, where)
@@ -129,8 +129,8 @@ def describe_hdf5(group: h5py.Group, name: str, where: str) -> tuple[tuple[int, 
     """
     Return shape and type of an array that is not to be read, None where there is none in this file.
 
-    :param group: as for :func:`read_hdf5`
-    :param name: what may be an array there
+    :param group: see :func:`read_hdf5`
+    :param name: name of what may be an array
     :param where: the file, for messages
     """
     with contextlib.suppress(Exception):  # over damaged files h5py raises nearly everything
@@ -144,8 +144,8 @@ def check_within(group: h5py.Group, name: str, where: str) -> None:
     """
     Look at a path's links before HDF5 follows them: to open another file can run into a pipe, and wait for ever.
 
-    :param group: where the path starts
-    :param name: the path, of whatever is there or not
+    :param group: group at which the path starts
+    :param name: the path, whether anything is there or not
     :param where: the file and the episode, for messages
     :raises DatasetError: a link leads to another file, or too many follow each other
     """
@@ -236,8 +236,8 @@ def open_group(parent: h5py.Group, name: str, where: str) -> h5py.Group:
     """
     A group of the same file.
 
-    :param parent: what holds it
-    :param name: what it is called there
+    :param parent: group that holds it
+    :param name: name of the group in `parent`
     :param where: the file, for messages
     :raises DatasetError: there is none, or it lies in another file
     """

@@ -19,11 +19,11 @@ def decode_images(
     encoded: Any, n_steps: int, shape: tuple[int, ...], where: str, size: tuple[int, int] | None = None
 ) -> np.ndarray:
     """
-    :param encoded: gives at least T images by their number, the bytes of a JPEG or PNG file each
+    :param encoded: sequence of at least T images, each the bytes of a JPEG or PNG file
     :param n_steps: T
     :param shape: (height, width, channels) that each must have
     :param where: the file, the episode and the camera
-    :param size: (height, width) that all are brought to; None keeps them
+    :param size: (height, width) that all images are resized to; None keeps their size
     :return: (T, height, width, channels) uint8
     :raises DatasetError: names the first step whose image is damaged or has another shape
     """

@@ -83,14 +83,15 @@ def load_episodes(
     - a :class:`~sb3_dtfm.data.Trajectory`
     - a trajectory of the package imitation: `obs`, `acts`, `terminal`, `rews` where it has some
     - a list of steps `(observation, action, reward, terminated, truncated)`, as they come from a Gymnasium environment:
-      the observation that the action was chosen on, and what `env.step(action)` then returned, with the info, whose success
-      is known of the episode, or without; or of `(observation, action, reward, done)`; with the next observation, too,
-      before the reward as SB3 has it, or behind it; or of dictionaries or named tuples of these
+      the observation that the action was chosen on, and what `env.step(action)` then returned, with or without the info,
+      which may tell of success; or of `(observation, action, reward, done)`; with the next observation, too, before the
+      reward as SB3 has it, or behind it; or of dictionaries or named tuples of these
 
-    Without rewards a success has a reward of 1 at its last step, and every episode is one where nothing tells.
+    Without rewards a success has a reward of 1 at its last step, and an episode of unknown success counts as one.
 
-    :param episodes: at least one
-    :param observation_keys: which arrays, or entries of dictionary observations, make up the observation, in this order
+    :param episodes: list of episodes, at least one
+    :param observation_keys: names of the arrays, or entries of dictionary observations, that make up the observation, in
+        this order
     :param action_bounds: see :func:`~sb3_dtfm.data.load_flat`
     :param clip_actions: see :func:`~sb3_dtfm.data.load_flat`
     :param action_space: see :func:`~sb3_dtfm.data.load_flat`
@@ -167,7 +168,7 @@ def _trajectory(
 
 
 def _arrays_of_episode(episode: Any, where: str) -> Mapping[str, Any]:
-    """Its arrays by the names of flat ones."""
+    """An episode's arrays by the names of flat ones."""
     if isinstance(episode, Mapping):
         return episode
     if hasattr(episode, "obs") and hasattr(episode, "acts"):
@@ -252,8 +253,8 @@ def _breaks(replay_buffer: ReplayBuffer, order: np.ndarray) -> np.ndarray:
     """
     Find breaks between steps: a second `learn()` begins with a reset, which no flag tells of.
 
-    :param order: (T,) of the buffer's rows
-    :return: (T - 1, environments) bool
+    :param order: (T,) rows of the buffer, oldest first
+    :return: (T - 1, environments) bool, True where a step does not go on to the next one
     """
     breaks = np.zeros((max(0, len(order) - 1), replay_buffer.n_envs), bool)
     if replay_buffer.optimize_memory_usage:  # one array holds both, and SB3 marks such a step itself
@@ -285,7 +286,7 @@ def load_replay_buffer(
     beginning has been written over.
 
     :param replay_buffer: replay buffer of any number of environments
-    :param observation_keys: which entries of dictionary observations make up the observation, in this order
+    :param observation_keys: names of the entries of dictionary observations that make up the observation, in this order
     :param clip_actions: bring actions outside of the action space to the nearest bound
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
     :param storage: storage of the steps; memory if not given

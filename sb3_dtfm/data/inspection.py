@@ -10,7 +10,7 @@ from sb3_dtfm.actions import bounds_of, vector_space
 from sb3_dtfm.data.buffer import TrajectoryBuffer
 from sb3_dtfm.data.trajectories import ReturnReference
 
-# Below this share of the range of actions that the data use, learning is in a corner of it.
+# Share of the range of actions below which the data use only a corner of it.
 NARROW = 0.1
 # Actions this near to a bound, as a share of the range, are at it; worth a word if they are this share of all.
 AT_BOUND, MANY = 1e-3, 0.5
@@ -41,9 +41,9 @@ class Inspection(NamedTuple):
     """
     Findings.
 
-    :param observations: of O dimensions
-    :param actions: of A dimensions, in the environment's range; of a Discrete space's n actions, whose mean is a share
-    :param at_bounds: share of all actions' entries at a bound of the action space, of no meaning for Discrete ones
+    :param observations: range of the observations, O dimensions
+    :param actions: range of the actions, A dimensions; for a Discrete space its n choices, whose means are their shares
+    :param at_bounds: share of all actions' entries at a bound of the action space, in [0, 1]; meaningless for Discrete ones
     :param target_return: see :func:`suggested_target_return`
     :param remarks: sentences about what may be wrong
     """
@@ -59,7 +59,7 @@ def inspect_buffer(buffer: TrajectoryBuffer) -> Inspection:
     """
     Look at every step.
 
-    :param buffer: as it would be learned from
+    :param buffer: recorded episodes to learn from
     """
     observations, values = _range(buffer.observations), buffer.actions
     actions = _range(values)
@@ -81,8 +81,8 @@ def suggested_target_return(buffer: TrajectoryBuffer) -> float:
     A target return: the mean of the best tenth of the episodes; of all episodes where the start decides their returns,
     since the best tenth had the easiest starts then.
 
-    :param buffer: as it would be learned from
-    :return: environment reward units, four digits
+    :param buffer: recorded episodes to learn from
+    :return: target return, environment reward units, rounded to four digits
     """
     return float(f"{return_reference(buffer).suggested:.4g}")
 
@@ -91,8 +91,8 @@ def return_reference(buffer: TrajectoryBuffer) -> ReturnReference:
     """
     Recorded returns, which the returns of a model are compared with.
 
-    :param buffer: as it is learned from
-    :return: without the return of random actions, which only an environment tells
+    :param buffer: recorded episodes to learn from
+    :return: reference without the return of random actions, which only an environment tells
     """
     returns, rate = buffer.episode_returns, float(buffer.successes.mean())
     return ReturnReference(
@@ -110,8 +110,8 @@ def explained_by_start(buffer: TrajectoryBuffer) -> float:
     Share of the returns' variance that first observations explain: a Gaussian process predicts each episode's return from
     those of all others (Rasmussen and Williams, 2006, equation 5.12).
 
-    :param buffer: of any number of episodes, of which those that are there twice count once
-    :return: in [0, 1]; 0 for fewer than ten episodes
+    :param buffer: any number of recorded episodes, of which duplicates count once
+    :return: share in [0, 1]; 0 for fewer than ten episodes, or if all returns are equal
     """
     stored = buffer.stored["observations"]
     starts = stored.index_select(0, th.from_numpy(buffer.episodes.starts).to(stored.device))
@@ -124,7 +124,7 @@ def explained_by_start(buffer: TrajectoryBuffer) -> float:
     scaled = deviations[:, 1:] / np.where(std[1:] > 0, std[1:], 1.0)
     products, width = scaled @ scaled.T, START_WIDTH**2 * max(1, np.count_nonzero(std[1:]))
     alike = np.exp((products - 0.5 * (np.diag(products)[:, None] + np.diag(products))) / width)
-    # The 1 that is added has the mean predicted, too.
+    # Adding 1 to all covariances has the mean predicted, too.
     inverse = np.linalg.inv(1.0 + alike + START_NOISE * np.eye(len(table)))
     residuals = inverse @ deviations[:, 0] / np.diag(inverse)
     by_the_mean = deviations[:, 0] * len(table) / (len(table) - 1)

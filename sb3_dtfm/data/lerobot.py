@@ -43,7 +43,7 @@ def fingerprint_lerobot(path: str | os.PathLike[str], options: dict[str, Any]) -
     Take the fingerprint of a folder as it is now.
 
     :param path: the folder
-    :param options: of :func:`load_lerobot`
+    :param options: options of :func:`load_lerobot`
     """
     path = Path(path).expanduser()
     return Fingerprint.of(path.name, path, json_options(options))
@@ -69,15 +69,15 @@ def load_lerobot(
     memory; images are read episode by episode.
 
     :param path: the folder
-    :param observation_keys: which features make up the observation, in this order, as `observation.state`; or what the
-        environment calls each of them, `{"pixels": "observation.image", "agent_pos": "observation.state"}`
-    :param image_size: (height, width) that all images are brought to, see :func:`~sb3_dtfm.envs.resize_image`; None keeps
+    :param observation_keys: names of the features that make up the observation, in this order, such as `observation.state`;
+        or a mapping from the environment's names, `{"pixels": "observation.image", "agent_pos": "observation.state"}`
+    :param image_size: (height, width) that all images are resized to, see :func:`~sb3_dtfm.envs.resize_image`; None keeps
         them as they are
     :param episodes: numbers of the episodes to read, in this order; all if not given
     :param action_bounds: smallest and largest action, numbers or (A,) each; where they are not given, those of
         `action_space`, or what has been recorded
     :param clip_actions: bring actions outside of them to the nearest bound, however far, instead of refusing them
-    :param action_space: the environment's
+    :param action_space: the environment's action space
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
     :param storage: storage of the steps; memory if not given
     :raises DatasetError: files missing or damaged, other numbers of episodes or frames than `meta/info.json` tells of, NaN
@@ -171,7 +171,7 @@ def _info(folder: Path, source: str) -> dict[str, Any]:
 def _names(
     keys: Sequence[str] | Mapping[str, str] | None, features: Mapping[str, str], maps: Collection[str], source: str
 ) -> dict[str, str]:
-    """The features that are observed, by the names that they have in the observation; maps of depth if they are named."""
+    """The observed features, by their names in the observation; depth maps only where `keys` names them."""
     known = sorted(name for name, dtype in features.items() if dtype in (*NUMBERS, IMAGE, VIDEO))
     offered = [name for name in known if name.startswith(OBSERVATION) and name not in maps]
     chosen = offered if keys is None else keys
@@ -221,8 +221,8 @@ def _check_labels(columns: dict[str, np.ndarray], labels: Sequence[str], reward:
 
 def _rewards(labels: dict[str, np.ndarray], reward: str, n_steps: int) -> tuple[np.ndarray, bool, bool | None]:
     """
-    :param labels: (T,) each, of an episode, by the names of their columns
-    :param reward: the column of the rewards, if there is one
+    :param labels: labels of an episode, (T,) each, by column name
+    :param reward: name of the rewards' column, which may be missing
     :param n_steps: T
     :return: rewards of all steps, or up to the success; whether the task was done then, and whether it ever was
     """

@@ -33,13 +33,13 @@ class Columns:
     """
     The columns of all Parquet files below a folder.
 
-    :param folder: of the dataset
-    :param part: folder in it
-    :param names: of the columns, which are read at once
-    :param source: for messages
-    :ivar numbers: (N, .) by column
-    :ivar files: each file and its number of rows
-    :ivar n_stored: bytes of the files
+    :param folder: folder of the dataset
+    :param part: path of a folder inside of it
+    :param names: names of the columns, which are all read now
+    :param source: name of the dataset, for messages
+    :ivar numbers: arrays (N, .) by column name
+    :ivar files: paths of the files, with their numbers of rows
+    :ivar n_stored: size of the files, bytes
     :raises DatasetError: no file, a column that is missing or holds no numbers, or a damaged file
     """
 
@@ -76,13 +76,13 @@ class Cameras:
     """
     Reads images episode by episode.
 
-    :param folder: of the dataset
-    :param info: what it says of itself
-    :param cameras: features of images or videos that are wanted
+    :param folder: folder of the dataset
+    :param info: content of its `meta/info.json`
+    :param cameras: names of the image or video features to read
     :param files: the Parquet files of its steps, with their numbers of rows
-    :param size: (height, width) that all images are brought to; None keeps them
-    :param source: for messages
-    :raises DatasetError: sizes or frame rate are missing, or where an episode begins in a video
+    :param size: (height, width) that all images are resized to; None keeps their size
+    :param source: name of the dataset, for messages
+    :raises DatasetError: sizes, the frame rate, or the starts of episodes in a video are missing
     """
 
     def __init__(
@@ -114,14 +114,14 @@ class Cameras:
 
     @functools.cached_property
     def _image_files(self) -> set[Path]:
-        """Looked for once, and only where a dataset names files: it has one for each step."""
+        """All files of the folder, listed once, and only where a dataset names image files: it has one for each step."""
         return set(files_below(self._folder))
 
     def read(self, camera: str, episode: int, rows: np.ndarray, times: np.ndarray) -> np.ndarray:
         """
-        :param camera: one of them
-        :param episode: its number
-        :param rows: (T,) of the images in all Parquet files together
+        :param camera: name of one of the cameras
+        :param episode: number of the episode
+        :param rows: (T,) rows of the images, counted over all Parquet files
         :param times: (T,) seconds from the beginning of the episode
         :return: (T, height, width, channels) uint8
         :raises DatasetError: missing or damaged, or of another shape; names file, episode and step
@@ -136,7 +136,7 @@ class Cameras:
         return read_frames(path, begin + times, self._info["fps"], self._shapes[camera], self._size, where)
 
     def _video(self, camera: str, episode: int) -> tuple[Path, float]:
-        """Its file, and when the episode begins in it, seconds."""
+        """The video's file, and the episode's start in it, seconds."""
         version, begin = self._info["codebase_version"][1], 0.0
         values: dict[str, Any] = {"video_key": camera, EPISODE: episode}
         if self._begins is None:
@@ -157,7 +157,7 @@ class Cameras:
         return self._folder / path, begin
 
     def _encoded(self, camera: str, rows: np.ndarray, where: str) -> list[bytes]:
-        """The bytes of some images, whose batches are read one by one: a small file can tell of one image many times."""
+        """The bytes of some images, whose batches are read one by one: a small file can refer to one image many times."""
         pyarrow = import_pyarrow(self._source)
         found: dict[int, Any] = {}
         files = np.searchsorted(self._stops, rows, side="right")  # of each row
@@ -182,8 +182,8 @@ class Cameras:
 def _rows(file: Any, camera: str, rows: np.ndarray) -> Iterator[tuple[int, Any]]:
     """
     :param file: an open Parquet file
-    :param rows: of the file, (T,)
-    :return: each with its image
+    :param rows: (T,) rows of the file
+    :return: pairs of a row and its image
     """
     start = 0
     for number in range(file.num_row_groups):

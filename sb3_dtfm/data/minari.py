@@ -54,7 +54,7 @@ REACHED_AFTER = 10.0
 FORMATS = ("hdf5", "arrow", "parquet")
 # Minari 0.5.3, the newest for NumPy 1 and Python 3.10, refuses files of 0.5.4, which differ only in images.
 minari.supported_dataset_versions.add("0.5.4")
-# Entries of the vector that a step's observation, or action, becomes: no task has as many.
+# Most entries of the vector that a step's observation, or action, becomes: no task has as many.
 MOST_ENTRIES = 2**20
 
 
@@ -73,8 +73,8 @@ def fingerprint_minari(dataset: str | minari.MinariDataset, options: dict[str, A
     """
     Take the fingerprint of a dataset as it is now, downloaded if necessary, and of its choice of episodes.
 
-    :param dataset: as for :func:`load_minari`
-    :param options: of :func:`load_minari`
+    :param dataset: see :func:`load_minari`
+    :param options: options of :func:`load_minari`
     """
     dataset = open_minari(dataset) if isinstance(dataset, str) else dataset
     episodes = dataset.episode_indices.tolist()
@@ -99,11 +99,12 @@ def load_minari(
     Nothing that its metadata name is imported, built or run: of `env_spec` only the id is read.
 
     :param dataset: id (`namespace/name-vN`) or an opened dataset, whose choice of episodes is kept
-    :param observation_keys: which entries of dictionary observations, cameras too, make up the observation, in this order
+    :param observation_keys: names of the entries of dictionary observations, cameras too, that make up the observation, in
+        this order
     :param clip_actions: bring actions outside of the dataset's action space to the nearest bound
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
     :param storage: storage of the steps; memory if not given
-    :return: its episodes, with the normalised-score scale of its metadata where it names one
+    :return: buffer of its episodes, with the normalised-score scale of its metadata where it names one
     :raises DatasetError: neither found nor downloaded, damaged, or not fit for learning (names the file, episode and field)
     """
     if isinstance(dataset, str):
@@ -193,13 +194,13 @@ def _reach_hub() -> None:
 
 def read_metadata(folder: Path, dataset_id: str) -> dict[str, Any]:
     """
-    Read what a dataset says of itself, checked before anybody acts on it.
+    Read a dataset's metadata, checked before anything is done with them.
 
     Minari takes memory for as many episodes and entries as are named, and where a space is missing it builds the
     environment of `env_spec`: it then imports and calls whatever stands there.
 
-    :param folder: of the dataset's data
-    :param dataset_id: for messages
+    :param folder: folder of the dataset's data
+    :param dataset_id: id of the dataset, for messages
     :raises DatasetError: names the field, what was found and what is accepted; or a link that leads out of the folder
     """
     path = folder / METADATA_FILE_NAME
@@ -270,11 +271,11 @@ def _score_reference(metadata: dict[str, Any]) -> ScoreReference | None:
 
 class _Episode(NamedTuple):
     """
-    :param read: gives an array of observations, actions, rewards, terminations, truncations; a part of a Dict or Tuple by
-        its keys
-    :param read_images: gives images of observations as they are stored: an array, or the bytes of a file each
-    :param success: flags of the steps, whose last one tells of the episode, after one of its reset or not; None where
-        nothing is told
+    :param read: function that returns an array of observations, actions, rewards, terminations or truncations; a part of a
+        Dict or Tuple by its keys
+    :param read_images: function that returns images of observations as stored: an array, or the bytes of a file each
+    :param success: success flags, (T,) or, with the reset's, (T + 1,), whose last one tells of the episode; None where the
+        data do not tell
     """
 
     read: ReadArray
@@ -346,9 +347,9 @@ def make_trajectory(
     """
     One episode of a Minari file.
 
-    :param read: see :class:`_Episode`, for the next two, too
-    :param chosen: what is observed
-    :param name: what the file calls the episode
+    :param read: see :class:`_Episode`, also for the next two
+    :param chosen: entries that are observed
+    :param name: name of the episode in the file
     :param source: the file, for messages
     :raises DatasetError: one of its arrays is missing, or they differ in length
     """
@@ -389,7 +390,7 @@ def _images(stored: np.ndarray, n_steps: int, shape: tuple[int, ...], where: str
     :param stored: (T, ...) or (T + 1, ...), bytes of images; or files of images: Minari 0.5.3 makes a JPEG of nearly every
         one, 0.5.4 unless it is told otherwise
     :param n_steps: T
-    :param shape: of an image
+    :param shape: shape of an image
     :return: (T, ...)
     """
     if isinstance(stored, np.ndarray) and stored.shape[1:] in (shape, (math.prod(shape),)):

@@ -19,9 +19,9 @@ from sb3_dtfm.envs.observation_spaces import (
     without_images,
 )
 
-# How a JPEG image begins.
+# First bytes of a JPEG image.
 JPEG = b"\xff\xd8\xff"
-# Gives one of an episode's arrays by its name, followed by the keys of the parts of a Dict or Tuple that lead to it.
+# Function that returns an episode's array by its name and the keys of the parts of a Dict or Tuple that lead to it.
 ReadArray: TypeAlias = Callable[..., np.ndarray]
 
 
@@ -51,8 +51,8 @@ def observed(observations: Any, keys: Sequence[str] | None, space: spaces.Space 
     :param observations: (T, ...), or a dictionary of such
     :param keys: entries of the dictionary, cameras too, that make up the observation, in this order; None for all
     :param space: the environment's observation space; None if it is unknown
-    :param where: whose they are, for messages
-    :return: without vectors a single number that is always 0
+    :param where: origin of the observations, for messages
+    :return: vectors and images; without vectors a single number that is always 0
     :raises DatasetError: as :func:`in_space` and :func:`chosen`
     """
     if isinstance(observations, Mapping):
@@ -85,8 +85,8 @@ def stacked(steps: Sequence[Any], where: str) -> np.ndarray:
     """
     One array after the other.
 
-    :param steps: an array of each step
-    :param where: whose they are, for messages
+    :param steps: an array for each step
+    :param where: origin of the arrays, for messages
     :return: (T, ...)
     :raises DatasetError: a step has another shape than the first
     """
@@ -109,7 +109,7 @@ def as_vectors(observations: Any, where: str) -> np.ndarray:
     Observations of an unknown space.
 
     :param observations: (T, ...), or a dictionary of such, of any depth
-    :param where: whose they are, for messages
+    :param where: origin of the observations, for messages
     :return: (T, O), the entries of a dictionary side by side in the order of their keys
     :raises DatasetError: parts of different lengths, or without steps
     """
@@ -133,10 +133,10 @@ def in_space(observations: Any, space: spaces.Space | None, where: str) -> np.nd
     """
     Observations as the vectors that the wrapper makes of them in an environment, which knows what is a choice.
 
-    :param observations: as for :func:`as_vectors`
+    :param observations: see :func:`as_vectors`
     :param space: the environment's observation space; None if it is unknown
-    :param where: whose they are, for messages
-    :return: (T, O), with a vector of zeros and a one for each Discrete number
+    :param where: origin of the observations, for messages
+    :return: (T, O), with a one-hot vector for each Discrete number
     :raises DatasetError: as :func:`as_vectors`, or not in the space
     """
     if isinstance(space, spaces.Dict | spaces.Tuple):
@@ -163,10 +163,10 @@ def chosen(observations: Any, keys: Sequence[str], space: spaces.Space | None, w
     """
     Some entries of dictionary observations side by side, in the order of their keys.
 
-    :param observations: a dictionary, as for :func:`in_space`
-    :param keys: of the entries
+    :param observations: dictionary of observations, see :func:`in_space`
+    :param keys: names of the entries
     :param space: the environment's observation space, or None
-    :param where: whose they are, for messages
+    :param where: origin of the observations, for messages
     :return: (T, O)
     :raises DatasetError: as :func:`in_space`, or there is no such entry
     """
@@ -192,9 +192,9 @@ def check_order(
     Compare the entries that were chosen with those of an environment, which shows all of its own, sorted by name.
 
     :param keys: `observation_keys`; only a mapping has to have the environment's names
-    :param cameras: those of them that are images
+    :param cameras: names of the images among them
     :param space: the environment's observation space, None if it is unknown
-    :param source: for messages
+    :param source: name of the dataset, for messages
     :raises DatasetError: they have another order than the environment's, or a mapping names what it does not observe
     """
     if keys is None or not isinstance(space, spaces.Dict):
@@ -217,12 +217,12 @@ def check_order(
 
 class Chosen(NamedTuple):
     """
-    A choice of what is observed of a dataset's own space.
+    The entries of a dataset's observation space that are observed.
 
-    :param cameras: the spaces of its images, by camera
-    :param keys: of the other entries of a Dict, in this order; None for all
-    :param vectors: the space of these entries, sorted; None of images alone
-    :param alone: an image is all that is observed, and no entry of a Dict
+    :param cameras: image spaces by camera
+    :param keys: names of the other entries of a Dict, in this order; None for all
+    :param vectors: space of these entries, with sorted keys; None for images alone
+    :param alone: whether the dataset's space is no Dict, so that an image is the whole observation
     """
 
     cameras: dict[str, spaces.Box]
@@ -238,11 +238,11 @@ class Chosen(NamedTuple):
 
 def chosen_space(space: spaces.Space, keys: Sequence[str] | None, source: str) -> Chosen:
     """
-    Return what is left of a dataset's observation space.
+    Choose entries of a dataset's observation space.
 
-    :param space: of the dataset
-    :param keys: of a Dict's entries, cameras too, in this order; None for all of the space
-    :param source: for messages
+    :param space: observation space of the dataset
+    :param keys: names of a Dict's entries, cameras too, in this order; None for the whole space
+    :param source: name of the dataset, for messages
     :raises DatasetError: no Dict, or no such entry, or none that can be used
     """
     cameras = image_spaces(space)
@@ -266,7 +266,7 @@ def flatten_chosen(read: ReadArray, chosen: Chosen, where: str) -> list[np.ndarr
     """
     Flatten the chosen vectors, as :func:`flatten_observations` does.
 
-    :param chosen: of the dataset's space
+    :param chosen: chosen entries of the dataset's space
     """
     if chosen.vectors is None:
         return []
@@ -280,10 +280,10 @@ def flatten_chosen(read: ReadArray, chosen: Chosen, where: str) -> list[np.ndarr
 
 def check_no_images(array: np.ndarray, where: str) -> None:
     """
-    Refuse what the wrapper refuses in an environment, and tell of what it tells of.
+    Refuse what the wrapper refuses in an environment, and warn of what it warns of.
 
     :param array: (T, ...)
-    :param where: whose it is, for messages
+    :param where: origin of the array, for messages
     :raises DatasetError: bytes with more than one axis a step, or other numbers in the shape of images
     """
     if array.dtype == np.uint8 and array.ndim == 4:
@@ -304,7 +304,7 @@ def flatten_observations(read: ReadArray, path: tuple[str | int, ...], space: sp
     """
     A whole episode's observations as columns of the vector that the wrapper makes of one observation.
 
-    :param read: gives one of its arrays by its name and the keys that lead to a part
+    :param read: function that returns one of its arrays by its name and the keys that lead to a part
     :param path: keys that lead to the part of the observations that `space` describes
     :param space: observation space with sorted keys
     :param where: the file and the episode, for messages

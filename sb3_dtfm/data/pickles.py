@@ -20,8 +20,8 @@ def unpickled(dataset: Any, allow_pickle: bool) -> Any:
     """
     Return what a pickle holds, and episodes of different lengths in arrays of objects as a list of episodes.
 
-    :param dataset: as for :func:`~sb3_dtfm.data.load_dataset`; what is no pickle stays as it is
-    :param allow_pickle: read pickles
+    :param dataset: see :func:`~sb3_dtfm.data.load_dataset`; what is no pickle stays as it is
+    :param allow_pickle: whether to read pickles
     :raises DatasetError: a pickle that is not allowed, or is damaged
     """
     if isinstance(dataset, str | os.PathLike):
@@ -55,9 +55,9 @@ def _as_episodes(arrays: Mapping[str, Any]) -> Any:
 
 def without_pickles(options: Mapping[str, Any] | None) -> dict[str, Any]:
     """
-    Options of :func:`~sb3_dtfm.data.load_dataset` that a model, settings or a run folder hold, which may be of others.
+    Options of :func:`~sb3_dtfm.data.load_dataset` from a model, settings or a run folder, which others may have written.
 
-    :param options: by name; None for none
+    :param options: options by name; None for none
     :raises DatasetError: they allow pickles, which only a call of `load_dataset` does
     """
     if "allow_pickle" in (options or {}):

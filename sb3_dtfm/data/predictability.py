@@ -54,7 +54,7 @@ def correlation_of_changes(buffer: TrajectoryBuffer) -> float:
     White noise on actions takes back in one step what it did in the last: -0.5 of noise alone, 0 of a script that jumps, and
     above 0 of a smooth course.
 
-    :return: of at most 16,384 steps; 0 where no action changes
+    :return: correlation over at most 16,384 steps, in [-1, 1]; 0 where no action changes
     """
     generator = th.Generator().manual_seed(0)
     later = th.nonzero(buffer.timesteps.cpu() >= 2).squeeze(1)
@@ -79,8 +79,8 @@ def prediction_errors(buffer: TrajectoryBuffer) -> PredictionErrors | None:
 
     Models that learn from the same buffer share the result.
 
-    :param buffer: Discrete actions count as vectors
-    :return: by the best of three penalties each; None where fewer than two episodes have a step that follows another
+    :param buffer: recorded episodes; Discrete actions count as vectors
+    :return: errors, each with the best of three penalties; None where fewer than two episodes have two successive steps
     """
     if buffer not in _known:
         _known[buffer] = _prediction_errors(buffer)
@@ -117,8 +117,8 @@ def _features(
     """
     Regressors without and with the return: the observation, and random features of it alone and of it with the return.
 
-    :param rows: (N,) of the stored tensors
-    :param returns: (N,) of whole episodes
+    :param rows: (N,) rows of the stored tensors
+    :param returns: (N,) returns of whole episodes
     :return: (N, F) each; without the return it counts as the mean one, so that both have the same number of features
     """
     observations = buffer.statistics().normalize(buffer.stored["observations"].index_select(0, rows).cpu())
@@ -142,7 +142,7 @@ def _held_out(features: th.Tensor, actions: th.Tensor, part: np.ndarray) -> list
 
     :param features: (N, F)
     :param actions: (N, A)
-    :param part: (N,) which each step belongs to
+    :param part: (N,) number of the part that each step belongs to
     :return: (N, A) for each penalty
     """
     predictions = [th.zeros_like(actions) for _ in PENALTIES]

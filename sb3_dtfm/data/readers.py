@@ -59,10 +59,10 @@ class Reader(NamedTuple):
     """
     A reader of datasets of one kind.
 
-    :param kind: what they are, for messages
-    :param accepts: whether something is one of them
-    :param load: reads one; its other parameters are the options that users have, and `storage`, where the steps go
-    :param fingerprint: what a cache of one is known by, given the dataset and the options for `load`; None for no caches
+    :param kind: description of such a dataset, for messages
+    :param accepts: function that tells whether something is such a dataset
+    :param load: function that reads one; its other parameters are the options that users have, and `storage` of the steps
+    :param fingerprint: function from the dataset and the options for `load` to a cache's fingerprint; None for no caches
     """
 
     kind: str
@@ -172,23 +172,23 @@ def load_dataset(
         `.csv` or `.parquet` or a DataFrame, see there too; the folder of a LeRobot dataset, see :func:`load_lerobot`; a list
         of episodes, see :func:`load_episodes`, or of steps, see :func:`load_steps`; an SB3 replay buffer, see
         :func:`load_replay_buffer`; a list of several datasets, see :func:`load_several`; a buffer
-    :param cache_dir: learn from memory-mapped files in this folder, for datasets larger than memory; they are written at
-        the first call and whenever the dataset has changed. None reads everything into memory
+    :param cache_dir: folder of memory-mapped files to learn from, for datasets larger than memory; they are written at the
+        first call and whenever the dataset has changed. None reads everything into memory
     :param env_id: Gymnasium id of the environment that the episodes count as coming from, whatever the dataset says
     :param env_args: the environment's description in robomimic's words, for robomimic files, see :func:`load_robomimic`
-    :param action_space: the environment's, for data that do not tell of a range of actions
-    :param observation_space: the environment's, for data that do not tell what is a choice: a Discrete part becomes a vector
-        of zeros and a one, as :class:`~sb3_dtfm.envs.ReturnToGoWrapper` shows it
-    :param max_episode_steps: leave out what episodes hold beyond so many steps, with a warning; see
+    :param action_space: the environment's action space, for data that do not tell of a range of actions
+    :param observation_space: the environment's observation space, for data that do not tell what is a choice: a Discrete
+        part becomes a one-hot vector, as :class:`~sb3_dtfm.envs.ReturnToGoWrapper` shows it
+    :param max_episode_steps: number of steps after which the rest of an episode is left out, with a warning; see
         :meth:`TrajectoryBuffer.within`. None keeps all
-    :param min_return: leave out episodes of a smaller return, environment reward units
-    :param best_share: keep this share of the episodes, those of the largest returns
-    :param success_only: keep the successes alone, by what the data say of each episode's last step; see
+    :param min_return: smallest return of an episode that is kept, environment reward units; None keeps all
+    :param best_share: share of the episodes that is kept, those of the largest returns, in (0, 1]; None keeps all
+    :param success_only: whether to keep only successes, by what the data say of each episode's last step; see
         :attr:`TrajectoryBuffer.successes`
-    :param fraction: keep this share of the episodes, randomly drawn
+    :param fraction: share of the episodes that is kept, randomly drawn, in (0, 1]
     :param fraction_seed: seed of that draw alone, so that different runs learn from the same episodes
-    :param allow_pickle: read pickles, which can run code: files of SB3's replay buffers (`.pkl`), and arrays of objects in
-        `.npz`; not accepted from `dataset_kwargs`, which files of others may hold
+    :param allow_pickle: whether to read pickles, which can run code: files of SB3's replay buffers (`.pkl`), and arrays of
+        objects in `.npz`; not accepted from `dataset_kwargs`, which files of others may hold
     :param kwargs: options of the reader: `on_invalid`, which is "raise" unless "drop" leaves episodes out that would be
         refused, with a warning that names their number and the first reason; `observation_keys` and `clip_actions`;
         `filter_key` for robomimic files and `episodes` for LeRobot datasets, see also :func:`load_flat`
@@ -243,7 +243,7 @@ def load_dataset_for(env: gym.Env, dataset: Dataset, **options: Any) -> Trajecto
     Read all episodes of a dataset as `train` reads them for an environment: up to its time limit.
 
     :param env: environment in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
-    :param dataset: as for :func:`load_dataset`
+    :param dataset: see :func:`load_dataset`
     :param options: further arguments of that function
     :raises DatasetError: it cannot be read, or was recorded on another task; versions may differ
     """

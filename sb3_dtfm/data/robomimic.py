@@ -47,7 +47,7 @@ def fingerprint_robomimic(path: str | os.PathLike[str], options: dict[str, Any])
     Take the fingerprint of a file as it is now.
 
     :param path: the file
-    :param options: of :func:`load_robomimic`
+    :param options: options of :func:`load_robomimic`
     :raises DatasetError: no such file, or one of another robot or controller, see :func:`load_robomimic`
     """
     options = dict(options)
@@ -97,20 +97,20 @@ def load_robomimic(
     gripper-to-cube vector had the opposite sign, and the two poses of Can, Square and the like the opposite order.
 
     :param path: the file
-    :param filter_key: read only the demonstrations listed in `mask/<filter_key>`, such as "train"
-    :param observation_keys: which of a demonstration's `obs` make up the observation, in this order; or what
-        the environment calls each of them, `{"pixels": "agentview_image"}`; robomimic's low-dimensional ones by default
+    :param filter_key: name of the list `mask/<filter_key>` of demonstrations to read, such as "train"; None reads all
+    :param observation_keys: names of the arrays in a demonstration's `obs` that make up the observation, in this order; or a
+        mapping from the environment's names, `{"pixels": "agentview_image"}`; robomimic's low-dimensional ones by default
     :param action_bounds: see :func:`~sb3_dtfm.data.load_flat`; only for files of other simulators than robosuite
     :param clip_actions: bring actions outside of the range to the nearest bound
-    :param action_space: the environment's; robosuite's files tell of their range themselves
-    :param env_id: the environment that the file's actions are meant for; not given, it is ours of the file's task, and a
-        file of another robot or controller is refused
+    :param action_space: the environment's action space; robosuite's files tell of their range themselves
+    :param env_id: Gymnasium id of the environment that the file's actions are meant for; by default ours of the file's task,
+        and a file of another robot or controller is refused
     :param env_args: `RobosuiteEnv.env_args` of the environment whose robot and controller have to be the file's; by default
         those of the registered ones
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
     :param storage: storage of the steps; memory if not given
-    :return: actions in the controller's input range, or in that of `action_bounds` or `action_space`; [-1, 1] if nothing
-        tells
+    :return: buffer with actions in the controller's input range, or in that of `action_bounds` or `action_space`; [-1, 1]
+        if nothing tells
     :raises DatasetError: no such file, not readable, nothing in it, unknown keys, wrong shapes, NaN or infinity, or actions
         out of range; names the file, the demonstration and the step
     """
@@ -206,7 +206,7 @@ def _read(
 
 
 def _number(name: str) -> tuple[int, str]:
-    """Order of "demo_2" before "demo_10"."""
+    """Sort key that puts "demo_2" before "demo_10"."""
     digits = re.search(r"(\d+)$", name)
     return (int(digits[1]) if digits else -1, name)
 
@@ -231,7 +231,7 @@ def _env_args(data: h5py.Group, source: str) -> dict[str, Any]:
 
 
 def _env_id(recorded: dict[str, Any], source: str, env_id: str | None, env_args: dict[str, Any] | None) -> str | None:
-    """Our environment of the file's task; if no id says what the file is meant for, its actions have to do the same."""
+    """Return the id of our environment of the file's task; check robot and controller if `env_id` is not given."""
     with wrap_dataset_errors(f"{source}: attribute 'env_args' of group 'data'"):
         own_id = env_id_from_robomimic(recorded)
         if own_id is not None and not env_id:
@@ -249,10 +249,10 @@ def check_controller(
     """
     Refuse an environment in which an action does something else than where the data were recorded.
 
-    :param controller: of the data, see :class:`~sb3_dtfm.data.TrajectoryBuffer`; None where they do not tell
-    :param env_args: the environment's, see :func:`load_robomimic`; None where it does not tell
+    :param controller: controller of the data, see :class:`~sb3_dtfm.data.TrajectoryBuffer`; None where they do not tell
+    :param env_args: the environment's description, see :func:`load_robomimic`; None where it does not tell
     :param name: name of the environment, for messages
-    :param source: of the data, for messages; None for those of a model
+    :param source: name of the data, for messages; None for the data of a model
     :raises DatasetError: robot, controller or control frequency differ
     """
     if controller is None or env_args is None:
@@ -269,7 +269,7 @@ def check_controller(
 
 
 def _check_count(group: h5py.Group, name: str, n_steps: int, where: str) -> None:
-    """Compare with the number of steps that the file itself tells of, if it does."""
+    """Compare the number of steps with the one that the file tells of, if it does."""
     told = group.attrs.get(name, n_steps)
     if not np.array_equal(told, n_steps):
         raise DatasetError(f"{where}: attribute {name!r} tells of {told} steps; there are {n_steps}.")
@@ -379,7 +379,7 @@ def _in_frame(vectors: np.ndarray, quaternions: np.ndarray) -> np.ndarray:
 
 
 def _is_robosuite(env_args: dict[str, Any]) -> bool:
-    """Whether robosuite recorded a file: robomimic's number of it, or a task or a controller as robosuite has it."""
+    """Return whether robosuite recorded a file: robomimic's number of it, or a task or a controller as robosuite has it."""
     controller = arm_controller(env_args.get("env_kwargs", {}))
     return bool(env_args.get("type") == ROBOSUITE_TYPE or env_id_from_robomimic(env_args) or controller)
 

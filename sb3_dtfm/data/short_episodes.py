@@ -8,7 +8,7 @@ import numpy as np
 from sb3_dtfm.data.episodes import EpisodeTable
 from sb3_dtfm.data.trajectories import Trajectory
 
-# Steps from which an episode is read by itself, and which episodes that are read together have at most.
+# Steps from which on an episode is read by itself, and most steps of episodes that are read together.
 LONG, MOST_STEPS = 64, 2**18
 
 
@@ -21,7 +21,7 @@ class ShortEpisodes(NamedTuple):
     :param terminated: (E,) bool
     :param truncated: (E,) bool
     :param successes: (E,) float64: 1, 0, or NaN where the data do not tell
-    :param one_by_one: gives each by itself, where one of them has to be named or left out
+    :param one_by_one: function that returns each by itself, where one of them has to be named or left out
     """
 
     steps: Trajectory
@@ -66,7 +66,7 @@ def blocks(stops: np.ndarray) -> Iterator[tuple[int, int]]:
     Choose which episodes to read together: short ones that lie side by side, and each long one by itself.
 
     :param stops: (E,) int64, the step after each episode's last one
-    :return: first episode, and the one after the last
+    :return: pairs of the first episode and the one after the last
     """
     long = np.flatnonzero(np.diff(stops, prepend=0) >= LONG)
     first = 0

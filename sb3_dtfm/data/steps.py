@@ -85,7 +85,7 @@ def _parts(step: Sequence[Any]) -> list[Any]:
 
 
 def arrays_of_steps(steps: Sequence[Any], where: str) -> dict[str, Any]:
-    """Arrays by the names of flat ones; of infos their success, and whether time ran out."""
+    """Arrays by the names of flat ones; of infos only their success, and whether time ran out."""
     steps = [_by_name(step) for step in steps]
     rows = steps if isinstance(steps[0], Mapping) else [_named(step) for step in steps]
     arrays: dict[str, Any] = {}

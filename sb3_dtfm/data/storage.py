@@ -71,7 +71,7 @@ class FileStorage:
     does not count as this process's memory.
 
     :param folder: an existing folder
-    :param description: what the progress bar says
+    :param description: text of the progress bar
     """
 
     def __init__(self, folder: Path, description: str) -> None:
@@ -139,7 +139,7 @@ def _dtype(name: str) -> np.dtype[Any]:
 
 
 def step_file(folder: Path, name: str) -> Path:
-    """The file of an array; of images the camera's name may hold any letters."""
+    """The file of an array; a camera's name may hold any characters."""
     return folder / f"{name if name in STEP_ARRAYS else 'image_' + quote(name, safe='')}.npy"
 
 
@@ -151,9 +151,9 @@ class MappedSteps:
     the next batch early and all at once: for cold pages that took 3 ms a batch, against 150 ms when each access to a page
     waited for the disk and for the neighbouring pages too.
 
-    :param folder: of a cache
-    :param name: one of `STEP_ARRAYS`, or a camera
-    :ivar check: of the cache's files, where it still goes on
+    :param folder: folder of a cache
+    :param name: name of the array, one of `STEP_ARRAYS` or a camera
+    :ivar check: future of the check of the cache's files in the background; None if there is none
     :raises OSError: no such file
     :raises ValueError: not a npy file, or cut off
     """
@@ -174,8 +174,8 @@ class MappedSteps:
         """
         Have the system start to read some rows, without waiting for them.
 
-        :param stops: the rows that end before each of these
-        :param n_rows: how many rows each time
+        :param stops: rows that each range ends before
+        :param n_rows: number of rows in each range
         :raises DatasetError: a file of the cache has turned out to be damaged
         """
         if self.check is not None and self.check.done():

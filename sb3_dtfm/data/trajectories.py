@@ -30,7 +30,7 @@ class DatasetError(ValueError):
     """
     A dataset cannot be used.
 
-    :param message: names the file, episode and step, what was found and what is accepted
+    :param message: message that names the file, episode and step, what was found and what is accepted
     """
 
     def __init__(self, message: str) -> None:
@@ -47,7 +47,7 @@ def wrap_dataset_errors(where: str, why: str = "the file is damaged or incomplet
     Turn whatever the libraries that read a file raise into our own error, which says where.
 
     :param where: the file, and the episode or field that is read
-    :param why: what is the matter then
+    :param why: likely cause, for the message
     :raises DatasetError: instead of any other exception, but of a package that is missing
     """
     try:
@@ -63,7 +63,7 @@ def check_real(dtype: Any, where: str) -> None:
     """
     Refuse what is no real number before it is read, or cast to one.
 
-    :param dtype: of an array
+    :param dtype: type of an array
     :param where: the file, the episode and the array
     :raises DatasetError: complex numbers, words, objects, records, dates
     """
@@ -75,8 +75,8 @@ def check_size(n_bytes: int, n_stored: int, where: str) -> None:
     """
     Refuse an array that claims to be far larger than what is stored of it, before memory is taken for it.
 
-    :param n_bytes: what it would take in memory
-    :param n_stored: bytes in the file
+    :param n_bytes: size in memory, bytes
+    :param n_stored: size in the file, bytes
     :param where: the file, the episode and the array
     :raises DatasetError: it does
     """
@@ -88,7 +88,7 @@ def check_size(n_bytes: int, n_stored: int, where: str) -> None:
 
 def check_flags(flags: np.ndarray, n_steps: int, where: str) -> np.ndarray:
     """
-    Return what is marked at each step.
+    Return flags as bool, one for each step.
 
     :param flags: (T,) or (T, 1), zeros and ones of any type
     :param n_steps: T
@@ -114,10 +114,10 @@ class Trajectory:
     :param observations: (T, O), the observation each action was chosen on
     :param actions: (T, A), in the environment's own range; (T,) where it has a Discrete action space
     :param rewards: (T,), environment reward units
-    :param terminated: the last step reached a terminal state
-    :param truncated: the last step hit a time limit; neither flag set means that the recording stopped mid-episode
+    :param terminated: whether the last step reached a terminal state
+    :param truncated: whether the last step hit a time limit; neither flag set means that the recording stopped mid-episode
     :param success: whether the task was done at the last step; None where the data do not tell
-    :param images: by camera, (T, height, width, channels) uint8, or channels first
+    :param images: images by camera, (T, height, width, channels) uint8, or channels first
     :param name: name of the episode in its file, for error messages
     """
 
@@ -154,7 +154,7 @@ class ReturnReference(NamedTuple):
     :param best_tenth: mean return of the best tenth of them, environment reward units
     :param best: largest return of them, environment reward units
     :param n_episodes: number of recorded episodes
-    :param start_decides: the first observation explains at least half of the returns' variance
+    :param start_decides: whether the first observation explains at least half of the returns' variance
     :param success_rate: share of the recorded episodes that succeeded, in [0, 1]; None where the data do not tell
     :param random: mean return of random actions, environment reward units; None where it was not measured
     """
@@ -180,7 +180,7 @@ class ReturnReference(NamedTuple):
         goal is the best tenth. If the start decides, a target above the mean is out of reach from most starts: then the
         goal is the mean. The mean is also the goal of a model without a target return, which copies all episodes.
 
-        :param target_return: environment reward units; None where the model has none, or does not look at it
+        :param target_return: target return, environment reward units; None where the model has none, or does not look at it
         """
         if target_return is None or (self.start_decides and _exceeds(target_return, self.recorded)):
             return self.recorded, "the recorded mean"
@@ -190,10 +190,10 @@ class ReturnReference(NamedTuple):
 
     def share(self, episode_return: float, goal: float) -> float | None:
         """
-        The part that a return is of the way from random actions to a goal, which also makes sense of negative returns.
+        The share of the way from random actions to a goal that a return covers, which also makes sense of negative returns.
 
-        :param episode_return: environment reward units
-        :param goal: environment reward units
+        :param episode_return: return to rate, environment reward units
+        :param goal: return to reach, environment reward units
         :return: 0 for random actions, 1 for the goal; None where random actions are not known to be worse than the goal
         """
         if self.random is None or goal <= self.random:
@@ -224,8 +224,8 @@ def check_action_space(space: spaces.Space, source: str) -> ActionSpace:
     """
     The action space, if actions from it can be learnt: scaled to [-1, 1] and back in float32, or one of several choices.
 
-    :param space: of a dataset or an environment
-    :param source: whose it is, for messages
+    :param space: action space of a dataset or an environment
+    :param source: name of the dataset or environment, for messages
     :raises DatasetError: neither a Box of floats of shape (A,) nor Discrete, or a dimension without bounds or width
     """
     problem = f"{source}: the action space is {space}"
@@ -258,8 +258,7 @@ def check_trajectory(
     """
     Refuse an episode that training must not see.
 
-    :param image_spaces: of its images, by camera; None takes them as they are
-
+    :param image_spaces: image spaces that are expected, by camera; None takes images as they are
     :return: (T,) float64, the returns-to-go, which have been looked at, too
     :raises DatasetError: names source, episode and step, what was found and what is accepted
     """
@@ -296,8 +295,8 @@ def check_images(
     images: Mapping[str, np.ndarray], image_spaces: Mapping[str, spaces.Box] | None, n_steps: int, where: str
 ) -> None:
     """
-    :param images: of an episode, by camera
-    :param image_spaces: of all episodes; None where this is the first one
+    :param images: images of an episode, by camera
+    :param image_spaces: image spaces of all episodes, by camera; None for the first episode
     :param n_steps: T
     :raises DatasetError: other cameras, sizes or numbers than bytes, or not one image a step
     """
@@ -353,7 +352,7 @@ def check_finite(array: np.ndarray, name: str, where: str) -> None:
     Refuse what float32 cannot hold.
 
     :param array: (T,) or (T, .), real numbers of any type
-    :param name: what they are
+    :param name: name of the numbers, for the message
     :param where: the file and the episode
     :raises DatasetError: names the first step whose number is NaN, infinite or too large
     """

@@ -18,9 +18,9 @@ def read_frames(
 
     :param path: an MP4 file
     :param times: (T,) seconds, ascending
-    :param fps: frames a second; a frame that is half of its duration away is none of that time
+    :param fps: frames per second; a time is shown by a frame at most half a frame's duration away
     :param shape: (height, width, 3) that the video must have
-    :param size: (height, width) that its frames are brought to; None keeps them
+    :param size: (height, width) that its frames are resized to; None keeps their size
     :param where: the episode, for messages
     :return: (T, height, width, 3) uint8
     :raises ImportError: PyAV is not installed

@@ -59,7 +59,7 @@ def fingerprint_zarr(path: str | os.PathLike[str], options: dict[str, Any]) -> F
     Take the fingerprint of the folder or zip as it is now.
 
     :param path: the folder or zip
-    :param options: of :func:`load_zarr`
+    :param options: options of :func:`load_zarr`
     :raises DatasetError: there is none
     """
     path = _existing(path)
@@ -73,7 +73,7 @@ def _existing(path: str | os.PathLike[str]) -> Path:
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """The group at its top, while it is read."""
+    """Open the group at the top of a folder or zip while it is read."""
     try:
         import zarr
     except ImportError as error:
@@ -99,7 +99,7 @@ def _check_metadata(read: Mapping[str, Callable[[], str | bytes]]) -> None:
     """
     Refuse arrays that are no numbers, and ways to store them that could run code, before any is opened.
 
-    :param read: gives the JSON of each file, by its name for messages
+    :param read: functions that return the JSON of each file, by the file's name for messages
     :raises DatasetError: names the file and what it asks for
     """
     for where, content in read.items():
@@ -116,7 +116,7 @@ def _check_metadata(read: Mapping[str, Callable[[], str | bytes]]) -> None:
 
 
 def _entries(found: Any) -> Iterator[tuple[str, Any]]:
-    """All names in JSON with their values, at any depth: an array may be called as a part of its metadata is."""
+    """All names in JSON with their values, at any depth: an array may have the name of a part of its metadata."""
     for each in found if isinstance(found, list) else ():
         yield from _entries(each)
     for name, value in found.items() if isinstance(found, dict) else ():
@@ -135,20 +135,21 @@ def load_zarr(
     storage: FileStorage | None = None,
 ) -> TrajectoryBuffer:
     """
-    A folder, or a zip, of `data/action` (N, A), of images (N, height, width, channels) and vectors (N, .) in `data`, and of
-    `meta/episode_ends` (E,). Images of floats with whole numbers from 0 to 255 become bytes. Episodes are read one by one.
+    Read a folder, or a zip, of `data/action` (N, A), of images (N, height, width, channels) and vectors (N, .) in `data`,
+    and of `meta/episode_ends` (E,). Images of floats with whole numbers from 0 to 255 become bytes. Episodes are read one by
+    one.
 
     Rewards are `data/rewards` or `data/reward`, (N,) or (N, 1), and episodes end as `data/terminals` and `data/timeouts`
     say, if there are any. Without rewards an episode counts as a success, with a reward of 1 at its last step.
 
-    :param path: of the folder or zip
-    :param observation_keys: which arrays of `data` make up the observation; or what the environment calls each of them, with
-        some of its columns: `{"pixels": "img", "agent_pos": "state[:2]"}`. By default all images, and `state` or
-        `obs`, or else everything that has N steps and is no action, reward or end
+    :param path: path of the folder or zip
+    :param observation_keys: names of the arrays of `data` that make up the observation, or of some columns of one, as
+        `state[:2]`; or a mapping from the environment's names to them, `{"pixels": "img", "agent_pos": "state[:2]"}`. By
+        default all images, and `state` or `obs`, or else everything that has N steps and is no action, reward or end
     :param action_bounds: see :func:`~sb3_dtfm.data.load_flat`
     :param clip_actions: see :func:`~sb3_dtfm.data.load_flat`
     :param action_space: see :func:`~sb3_dtfm.data.load_flat`
-    :param observation_space: the environment's
+    :param observation_space: the environment's observation space
     :param on_invalid: see :func:`~sb3_dtfm.data.load_dataset`
     :param storage: storage of the steps; memory if not given
     :raises ImportError: `sb3-dtfm[zarr]` is not installed
@@ -282,7 +283,7 @@ def _chosen(
     space: spaces.Space | None,
     source: str,
 ) -> dict[str, tuple[str, slice]]:
-    """The array and its columns of each entry of the observation; beside images numbers that the environment shows, too."""
+    """The array and its columns of each entry of the observation; beside images only vectors that it shows, too."""
     if keys is None:
         images = [name for name, array in data.items() if len(array.shape) == 4]
         vector = _first(data, OBSERVATIONS)

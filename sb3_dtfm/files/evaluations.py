@@ -9,7 +9,7 @@ def read_evaluations(path: Path) -> dict[str, np.ndarray]:
     """
     The arrays of an `evaluations.npz`, of E evaluations of n episodes each.
 
-    :param path: of the file
+    :param path: path of the file
     :return: `timesteps` (E,), `results` (E, n) in environment reward units, and others that there are, such as `successes`
     :raises FileNotFoundError: no such file
     :raises ValueError: a damaged file, or another one

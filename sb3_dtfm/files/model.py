@@ -43,7 +43,7 @@ class ModelFileError(ValueError):
     """
     A file is no model that can be loaded.
 
-    :param message: names the file, the member, what was found and what is accepted
+    :param message: message that names the file, the member, what was found and what is accepted
     """
 
     def __init__(self, message: str) -> None:
@@ -54,8 +54,8 @@ class ModelFile(NamedTuple):
     """
     Content of a file.
 
-    :param configuration: JSON's values, without what is only about the file itself
-    :param tensors: by group, for example "policy", and name
+    :param configuration: values from JSON, without those about the file itself
+    :param tensors: tensors by group, for example "policy", and by name
     """
 
     configuration: dict[str, Any]
@@ -65,7 +65,7 @@ class ModelFile(NamedTuple):
 def write_model(path: Any, model: ModelFile) -> None:
     """
     :param path: a path, where the file appears when it is complete; or a binary file object
-    :param model: what to write
+    :param model: content to write
     :raises OSError: names the path
     :raises ValueError: the configuration holds what JSON cannot
     """
@@ -98,9 +98,9 @@ def _digest(content: bytes) -> str:
 def read_model(path: Any, groups: Set[str], device: th.device, print_system_info: bool = False) -> ModelFile:
     """
     :param path: a path, with or without `.zip`; or a binary file object
-    :param groups: of tensors, that it is to hold
-    :param device: where the tensors are to be
-    :param print_system_info: print what the file was saved with
+    :param groups: names of the groups of tensors that it has to hold
+    :param device: device of the tensors
+    :param print_system_info: whether to print the system that the file was saved on
     :raises FileNotFoundError: no such file
     :raises ModelFileError: no model, a damaged one, one with other members than those that it should have, or a newer one
     """
@@ -112,7 +112,7 @@ def read_configuration(path: Any) -> dict[str, Any]:
     """
     A file's description of its model, without the tensors.
 
-    :param path: as for :func:`read_model`
+    :param path: see :func:`read_model`
     :raises FileNotFoundError: no such file
     :raises ModelFileError: no model of this package, or a damaged one
     """
@@ -165,8 +165,8 @@ class _Reader:
     """
     Reads an archive member by member, each only after what it claims to be has been checked.
 
-    :param archive: open for reading
-    :param name: of the file, for messages
+    :param archive: zip file, open for reading
+    :param name: name of the file, for messages
     """
 
     def __init__(self, archive: zipfile.ZipFile, name: str) -> None:

@@ -18,7 +18,8 @@ from sb3_dtfm.files.replacing import replacing
 OPSET = 18
 # The key of the settings among the file's metadata.
 METADATA = "sb3_dtfm"
-# Between the file's outputs and PyTorch's, relative to the largest: another order of summation stays far below.
+# Largest difference between the file's outputs and PyTorch's, relative to the largest output; another order of summation
+# stays far below.
 TOLERANCE = 1e-3
 
 
@@ -29,10 +30,10 @@ def write_onnx(
     Write a module as a graph, once it has been seen to give the module's numbers.
 
     :param path: file to write
-    :param module: in evaluation mode, on the CPU
-    :param inputs: of its `forward` by name, each (B, ...), or a dictionary of such; another B will do as well
-    :param outputs: names of what it returns
-    :param settings: what JSON can hold, for the file's metadata
+    :param module: module in evaluation mode, on the CPU
+    :param inputs: example inputs of its `forward` by name, each (B, ...), or a dictionary of such; the file takes any B
+    :param outputs: names of its outputs
+    :param settings: values that JSON can hold, for the file's metadata
     :raises ImportError: names the extra that is missing
     :raises OSError: names the path, where what was there before still is
     :raises ValueError: the module does what no graph holds, or the file does not give its numbers
@@ -67,7 +68,7 @@ def _flat(inputs: dict[str, Any]) -> dict[str, th.Tensor]:
 
 
 def _graph(module: nn.Module, inputs: dict[str, Any], outputs: list[str]) -> Any:
-    """:return: torch's ONNXProgram"""
+    """:return: ONNXProgram of torch"""
     batch = {0: th.export.Dim("batch")}
     rows = {name: dict.fromkeys(each, batch) if isinstance(each, dict) else batch for name, each in inputs.items()}
     # Captured here, by the one way whose graph is for all inputs: left alone, the exporter tries others if that one fails.

@@ -12,7 +12,7 @@ def warn(text: str, stacklevel: int = 1) -> None:
     """
     Warn with text that may come from a file.
 
-    :param text: of the warning
-    :param stacklevel: as for `warnings.warn` where this is called
+    :param text: text of the warning
+    :param stacklevel: number of frames above the warning's line, as in `warnings.warn`; 1 is the call of this function
     """
     warnings.warn(printable(text), stacklevel=stacklevel + 1)

@@ -53,7 +53,7 @@ def hidden_name(name: str) -> str:
     """
     A name for what is not complete yet, which tells who is writing it.
 
-    :param name: that it will have
+    :param name: name that it will have
     """
     return f".{name}.{MACHINE}.{os.getpid()}.{secrets.token_hex(4)}.part"
 
@@ -62,7 +62,7 @@ def find_leftovers(folder: Path) -> list[Path]:
     """
     Find what processes of this machine were writing when they were killed.
 
-    :param folder: where files are replaced
+    :param folder: folder in which files are replaced
     """
     found = ((path, LEFTOVER.fullmatch(path.name)) for path in folder.glob(".*.part"))
     return [

@@ -97,9 +97,9 @@ def check_settings(settings: Mapping[str, Any], where: str, names: Sequence[str]
     """
     Settings that a file says, of which RL-Zoo runs nothing that others wrote.
 
-    :param settings: by name
-    :param where: they stand, for messages
-    :param names: of `CLASSES` and `EVALUATED`, those that are used
+    :param settings: settings by name
+    :param where: name of the file that they stand in, for messages
+    :param names: names in `CLASSES` and `EVALUATED` of the settings that are used
     :return: the settings, with literals instead of the strings that RL-Zoo would evaluate
     :raises ValueError: a class that is not known here, or Python that is no literal
     """
@@ -145,7 +145,7 @@ def _check_nested(value: Any, where: str, seen: set[int]) -> None:
     """
     Check settings among a class's arguments, as the benchmark's evaluations have them.
 
-    :param seen: ids of what has been looked at, since YAML may name it again
+    :param seen: ids of values that have been checked, since YAML may refer to one again
     """
     if id(value) in seen or not isinstance(value, dict | list | tuple):
         return

@@ -37,7 +37,7 @@ class RecordingSummary(NamedTuple):
     :param path: the file
     :param n_episodes: successful episodes recorded
     :param n_attempts: episodes tried up to the last one recorded
-    :param mean_length: of the recorded episodes, steps
+    :param mean_length: mean length of the recorded episodes, steps
     :param seconds: wall-clock time
     """
 
@@ -77,7 +77,7 @@ def record_demonstrations(
     The file depends on the task, the number of episodes, seed, noise and pause only: attempt i draws everything from
     (seed, i), and the first successes in the order of attempts are kept, whatever the number of workers.
 
-    :param task: one of :func:`demonstrated_tasks`
+    :param task: name of the task, one of :func:`demonstrated_tasks`
     :param n_episodes: successful episodes to record
     :param output: the hdf5 file; it appears under this name when it is complete
     :param seed: seed of initial states and demonstrators
@@ -88,7 +88,8 @@ def record_demonstrations(
         clipped into the action space, and what is recorded is what was executed
     :param pause: steps that the hand rests before it closes, on average and after a first one; geometrically distributed,
         and 0 closes at once
-    :param cameras: whose images are recorded beside the numbers, see :class:`~sb3_dtfm.envs.robosuite.RobosuiteEnv`
+    :param cameras: names of the cameras whose images are recorded beside the numbers, see
+        :class:`~sb3_dtfm.envs.robosuite.RobosuiteEnv`
     :param camera_size: height and width of these images, pixels
     :raises FileExistsError: `output` exists and is not to be overwritten
     :raises ValueError: unknown task, numbers out of range, or fewer than one episode in 5 succeeds

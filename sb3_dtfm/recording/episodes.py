@@ -22,13 +22,13 @@ class RecordedEpisode:
     """
     One episode while it runs and when it is complete.
 
-    :param seed: what the environment was reset with
+    :param seed: seed that the environment was reset with
     :param observations: T + 1 arrays, or dicts of arrays
     :param actions: T arrays (A,), or numbers where the action space is Discrete
     :param rewards: T numbers, environment reward units
-    :param terminated: ended in a terminal state
-    :param truncated: ended at a time limit
-    :param reported: T times what the environment said of success; None where it said nothing
+    :param terminated: whether it ended in a terminal state
+    :param truncated: whether it ended at a time limit
+    :param reported: T reports of success by the environment; None where it said nothing
     :param states: T arrays (S,), the simulator's state before each action; empty unless asked for
     :param model_file: XML of the simulated scene; empty unless asked for
     """
@@ -45,7 +45,7 @@ class RecordedEpisode:
 
     @property
     def success(self) -> bool | None:
-        """Info of the last step."""
+        """Whether the last step's info reports success; None where it says nothing."""
         return self.reported[-1] if self.reported else None
 
 
@@ -56,7 +56,7 @@ class EpisodeRecorder(gym.Wrapper):
     Other wrappers stand around it, so that what is kept is what the environment itself gave and was given.
 
     :param env: the environment
-    :param simulation: keep the simulator's states and scene too, which `env.unwrapped` has as `state` and `model_file`
+    :param simulation: whether to keep the simulator's states and scene too, `state` and `model_file` of `env.unwrapped`
     """
 
     recorded: RecordedEpisode
@@ -95,8 +95,8 @@ def run_episodes(envs: Sequence[gym.Env], act: ActFunction, seeds: Sequence[int]
     environment itself, is truncated.
 
     :param envs: environments of one kind, with an :class:`EpisodeRecorder` among their wrappers
-    :param act: chooses the actions
-    :param seeds: what the environments are reset with
+    :param act: function that chooses the actions
+    :param seeds: seeds of the episodes, which the environments are reset with
     """
     envs = envs[: len(seeds)]
     numbers = list(range(len(envs)))
@@ -132,10 +132,10 @@ def add_noise(
     """
     The same actions with Gaussian noise, clipped into the action space. Discrete actions stay as they are.
 
-    :param act: chooses the actions
+    :param act: function that chooses the actions
     :param space: the action space
     :param noise: standard deviation, as a share of the action range (high - low)
-    :param generator: makes the source of an episode's noise from the episode's number
+    :param generator: function from an episode's number to the random generator of its noise
     :raises ValueError: noise for Discrete actions
     """
     if isinstance(space, spaces.Discrete):
@@ -160,7 +160,7 @@ def check_recording(n_episodes: int, noise: float, seed: int) -> None:
 
     :param n_episodes: episodes to record
     :param noise: standard deviation of action noise, as a share of the action range
-    :param seed: of everything random
+    :param seed: seed of everything random
     :raises ValueError: names the argument, what was given and what is accepted
     """
     if n_episodes < 1:

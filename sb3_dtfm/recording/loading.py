@@ -40,9 +40,9 @@ class AgentFiles:
 
     :param model: the agent's zip file
     :param env_kwargs: arguments of ``gymnasium.make``
-    :param wrapper: puts around an environment what stood between it and the agent
+    :param wrapper: function that wraps an environment as it was wrapped in training; None if it was not
     :param vec_normalize: file of the statistics that its observations were normalised with, where there is one
-    :param of_run: its run tells whether there is one
+    :param of_run: whether the agent's run tells if there is such a file
     """
 
     model: Path
@@ -120,7 +120,7 @@ def known_algorithms() -> dict[str, type[BaseAlgorithm]]:
 
 def algorithm_of(model: str | Path) -> str:
     """
-    Return which of ours a model is, by the folder of RL-Zoo's that it lies in.
+    Return which of our algorithms saved a model, by the folder of RL-Zoo's that it lies in.
 
     :param model: zip file or run folder, below a folder `dt` or `dtfm`
     :raises ValueError: there is none
@@ -139,7 +139,7 @@ def load_agent(algo: str, model: str | Path, device: str) -> BaseAlgorithm:
 
     :param algo: class name in any case, or RL-Zoo's name for it
     :param model: zip file
-    :param device: where its network runs
+    :param device: device of its network
     :raises ValueError: unknown algorithm, no agent, or one of another algorithm
     """
     if algo.lower() not in known_algorithms():
@@ -157,7 +157,7 @@ def check_saved_by(asked: type[BaseAlgorithm], model: Path) -> None:
     """
     Refuse an agent of another algorithm.
 
-    :param asked: its class should be
+    :param asked: class that the agent should have
     :param model: zip file
     :raises ValueError: it is none of this algorithm
 
@@ -196,10 +196,10 @@ def load_fitting_agent(
     Load an agent for an environment, and what normalises its observations.
 
     :param algo: class name in any case, or RL-Zoo's name for it, or "onnx"
-    :param files: the agent's
-    :param env: as the agent sees it
+    :param files: files of the agent
+    :param env: environment as the agent sees it
     :param vec_normalize_path: statistics instead of those in `files`, or "none" to insist that there are none
-    :param device: where its network runs
+    :param device: device of its network
     :raises FileNotFoundError: no such statistics
     :raises ValueError: agent, statistics and environment do not fit, or statistics are missing
     """

@@ -56,8 +56,8 @@ def write_minari(
     Write episodes as they come into a hidden folder, which takes the dataset's place when it is complete.
 
     :param dataset_id: `namespace/name-vN`; a dataset that is there is replaced
-    :param episodes: at least one
-    :param env: gives the spaces and the spec
+    :param episodes: recorded episodes, at least one
+    :param env: environment whose spaces and spec are stored
     :param metadata: entries of the dataset's metadata; `ref_max_score`, the episodes' mean return, is added
     """
     target = get_dataset_path(dataset_id)
@@ -106,7 +106,7 @@ def _clear_up(folder: Path, target: Path) -> None:
 
 def _check_space(folder: Path, seen: Any, episode: RecordedEpisode) -> None:
     """
-    HDF5 ends in a segmentation fault where the disk is full: leave before.
+    Stop before the disk is full, where HDF5 ends in a segmentation fault.
 
     :raises OSError: an episode may not fit
     """
@@ -135,9 +135,9 @@ def _write_images(path: Path, number: int, seen: Any, space: spaces.Space) -> No
     Store the images of an episode without loss: Minari reads PNG where it would have written JPEG.
 
     :param path: the file of the dataset
-    :param number: of the episode
+    :param number: number of the episode
     :param seen: observations of its steps, (T + 1, ...)
-    :param space: of an observation
+    :param space: observation space
     """
     with h5py.File(path, "a") as file:
         group = file[f"episode_{number}"]

@@ -45,11 +45,11 @@ class OnnxAgent:
         Predict as Stable-Baselines3's agents do.
 
         :param observation: (N, O)
-        :param state: there is none
-        :param episode_start: makes no difference
+        :param state: unused
+        :param episode_start: unused
         :param deterministic: must be True
         :return: actions (N, A), and None
-        :raises ValueError: to be sampled, where the file has no distribution
+        :raises ValueError: `deterministic` is False; the file has no distribution to sample from
         """
         if not deterministic:
             raise ValueError("An ONNX file gives one action for an observation and cannot be sampled (--stochastic).")

@@ -32,9 +32,9 @@ def write_robomimic(
     Write episodes into a file, which appears when it is complete.
 
     :param path: the file, which is replaced if it is there; its folder is made if necessary
-    :param episodes: with dicts of observations, simulator states and the scene
+    :param episodes: episodes with dicts of observations, simulator states and the scene
     :param env_args: description of the environment, stored as JSON
-    :param seed: of the filter keys `train`, `valid` (a tenth) and `50_percent`
+    :param seed: seed of the filter keys `train`, `valid` (a tenth) and `50_percent`
     """
     # In memory first: HDF5 ends in a segmentation fault where the disk is full.
     with replacing(path) as beside, h5py.File(beside, "w", driver="core", backing_store=False) as file:
@@ -49,7 +49,7 @@ def write_robomimic(
 
 
 def _write_demo(data: h5py.Group, name: str, episode: RecordedEpisode) -> int:
-    """Write one episode; its number of steps."""
+    """Write one episode and return its number of steps."""
     demo = data.create_group(name)
     n_steps = len(episode.actions)
     for key, values in stack_observations(episode.observations).items():

@@ -25,7 +25,7 @@ class Manner:
     One person's manner of doing one episode, drawn at random.
 
     :param rng: source of randomness
-    :param speed_range: between which `speed` is drawn
+    :param speed_range: smallest and largest `speed` to draw, action units
     """
 
     def __init__(self, rng: np.random.Generator, speed_range: tuple[float, float]) -> None:
@@ -55,7 +55,7 @@ class Demonstrator:
 
     A grasp that closes on nothing, or an object lost on the way, leads back to the hover point.
 
-    :param seed: of everything random; the same seed and observations give the same actions
+    :param seed: seed of everything random; the same seed and observations give the same actions
     :param pause: steps that the hand rests before it closes, on average and after a first one; 0 closes at once. People
         hesitate, and nothing tells for how long
     """
@@ -93,7 +93,7 @@ class Demonstrator:
         """
         The next action.
 
-        :param observation: (O,) of the task
+        :param observation: (O,) observation of the task
         :return: (7,) float32 in [-1, 1]
         """
         observation = np.asarray(observation, np.float64)
@@ -169,11 +169,11 @@ class Demonstrator:
 
     def _move(self, offset: np.ndarray, rotation: np.ndarray, gripper: float) -> np.ndarray:
         """
-        Towards a pose, smoothly and with an unsteady hand.
+        Return the action that moves towards a pose, smoothly and with an unsteady hand.
 
         :param offset: (3,) metres to go
         :param rotation: (3,) axis-angle to turn, radians
-        :param gripper: command
+        :param gripper: command of the gripper
         """
         manner = self.manner
         wanted = np.empty(6)

@@ -40,8 +40,8 @@ def _grasp_yaw(cube: float, neighbour: float) -> float:
     """
     Return how the hand turns for two faces of a cube, so that neither finger comes down towards its neighbour.
 
-    :param cube: its yaw, radians
-    :param neighbour: the direction of the other cube, radians
+    :param cube: yaw of the cube, radians
+    :param neighbour: direction of the other cube, radians
     :return: radians in [-pi / 2, pi / 2]
     """
     # The fingers open sideways: with the hand's yaw along the neighbour's direction, they pass it by on both sides.
