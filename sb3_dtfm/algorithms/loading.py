@@ -67,14 +67,14 @@ POSITIVE_BUFFERS = {
     "critic.reward_scale",
     "critic.advantage_std",
 }
-# The optimiser's state of a weight: its own shape, or a number.
+# State that the optimiser keeps of a weight, and whether it has the weight's shape or is a number.
 MOMENTS = {"step": False, "exp_avg": True, "exp_avg_sq": True}
 
 
 class SavedModel(NamedTuple):
     """
-    :param attributes: of the model, by name
-    :param tensors: of policy and optimiser, by name
+    :param attributes: attributes of the model, by name
+    :param tensors: tensors of policy and optimiser, by name
     :param source: the file, for messages
     """
 
@@ -86,9 +86,9 @@ class SavedModel(NamedTuple):
 @contextlib.contextmanager
 def wrap_file_errors(source: str) -> Iterator[None]:
     """
-    Turn errors about what does not fit into faults of the file.
+    Turn errors about values that do not fit into errors of the file.
 
-    :raises ModelFileError: names it
+    :raises ModelFileError: such an error, with the name of the file
     """
     try:
         yield
@@ -122,11 +122,11 @@ def read_saved(
     """
     A file's description of a model: plain data, each checked by its own rule.
 
-    :param path: the file
-    :param policies: the algorithm's, by alias
+    :param path: file to read
+    :param policies: policy classes of the algorithm, by alias
     :param custom_objects: attributes in place of those in the file
-    :param device: of the tensors
-    :param print_system_info: print what the file was saved with
+    :param device: device of the tensors
+    :param print_system_info: whether to print the system info that the file holds, as in SB3
     :raises ModelFileError: something is missing, of another algorithm, or not what a model was saved with
     """
     source = file_name(path)
@@ -228,8 +228,8 @@ def optimizer_state(optimizer: th.optim.Optimizer, tensors: Mapping[str, th.Tens
     """
     Return the state that `load_state_dict` takes. Settings of all weights, such as their decay, are the optimiser's own.
 
-    :param optimizer: of the model that is loaded
-    :param tensors: its own of the file
+    :param optimizer: optimiser of the model that is loaded
+    :param tensors: the optimiser's tensors in the file
     :param source: the file, for messages
     :raises ModelFileError: the state of another optimiser, or numbers that no optimiser arrives at
     """
@@ -264,8 +264,8 @@ def check_policy(policy: SequencePolicy, tensors: Mapping[str, th.Tensor], sourc
     """
     Refuse weights and statistics that such a policy cannot have, before any memory is taken for them.
 
-    :param policy: without a moving average, on the device "meta", where tensors are shapes only
-    :param tensors: of the file
+    :param policy: policy without a moving average, on the device "meta", where tensors are shapes only
+    :param tensors: the policy's tensors in the file
     :param source: the file, for messages
     :raises ModelFileError: names the tensor
     """

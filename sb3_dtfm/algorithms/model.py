@@ -68,10 +68,10 @@ class SequenceModel(BaseAlgorithm):
     """
     A sequence policy with its environment: built, saved, loaded, exported. It acts; `OfflineAlgorithm` learns, too.
 
-    :param policy: name or class
-    :param env: it acts in, or its Gymnasium id
+    :param policy: name or class of the policy
+    :param env: environment that the model acts in, or its Gymnasium id
     :param options: options of training, which become attributes
-    :param learning_rate: further arguments are those of `OfflineAlgorithm`
+    :param learning_rate: learning rate; this and further arguments are those of `OfflineAlgorithm`
     :param policy_kwargs: arguments of the policy
     :param tensorboard_log: folder of the TensorBoard log
     :param verbose: 0 silent, 1 prints the log
@@ -132,11 +132,11 @@ class SequenceModel(BaseAlgorithm):
         self.controller: dict[str, Any] | None = None
         self.buffer: TrajectoryBuffer | None = None
         self._means = RunningMeans()
-        self._last_saved: str | None = None  # by this object
+        self._last_saved: str | None = None  # file that this object wrote last
 
     def _check_arguments(self, learning_rate: Rule) -> None:
         """
-        :param learning_rate: what a number may be that is given as such: 0 is for those who load a model to act with it
+        :param learning_rate: rule for a learning rate that is a number: 0 is for those who load a model to act with it
         :raises ValueError: an argument out of range, by name
         """
         if isinstance(self.learning_rate, UnsavedSchedule) and learning_rate is POSITIVE:
@@ -190,7 +190,7 @@ class SequenceModel(BaseAlgorithm):
         """
         Seed everything random, the noise of `predict(deterministic=False)` included.
 
-        :param seed: None changes nothing
+        :param seed: seed; None changes nothing
         """
         super().set_random_seed(seed)
         if seed is not None and hasattr(self, "policy"):
@@ -267,7 +267,7 @@ class SequenceModel(BaseAlgorithm):
         """
         Refuse an environment in which an action does something else than in the data.
 
-        :param env: wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
+        :param env: environment wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
         :param name: name of the environment, for messages
         :raises DatasetError: its robot, controller or control frequency is another than :attr:`controller`
         """
@@ -289,12 +289,12 @@ class SequenceModel(BaseAlgorithm):
         SB3's loading, which runs nothing that a file holds; arguments are SB3's but for `allow_pickle`.
 
         :param path: file to load
-        :param env: see :meth:`set_env`
+        :param env: environment to act in, see :meth:`set_env`
         :param device: "auto", "cpu" or "cuda"
         :param custom_objects: attributes to use in place of those in the file
-        :param print_system_info: print what the file was saved with
+        :param print_system_info: whether to print the system info that the file holds, as in SB3
         :param force_reset: whether the environment is reset before the next step, as in SB3
-        :param allow_pickle: load files in SB3's format, whose pickles run code of their author: for files that you trust
+        :param allow_pickle: whether to load files in SB3's format, whose pickles run code of their author; for trusted files
         :param kwargs: attributes to change, `dataset` for example
         :raises ModelFileError: the file is damaged, pickled, of another algorithm, or holds what no model can have
         :raises ValueError: an attribute out of range or of another name, or an environment that does not fit
@@ -321,7 +321,7 @@ class SequenceModel(BaseAlgorithm):
         """
         A model of the plain data that a file holds; parameters and errors are those of :meth:`load`.
 
-        :param changed: attributes that are others from now on
+        :param changed: attributes to change, by name
         """
         saved = read_saved(path, cls.policy_aliases, custom_objects, get_device(device), print_system_info)
         attributes, source = saved.attributes, saved.source
@@ -379,9 +379,9 @@ class SequenceModel(BaseAlgorithm):
         """
         Set parameters as SB3 does, from a file as :meth:`save` makes them.
 
-        :param load_path_or_dict: the file, or what `get_parameters` gives
-        :param exact_match: all parameters have to be there, and no others
-        :param device: device to load them to
+        :param load_path_or_dict: file, or parameters as from `get_parameters`
+        :param exact_match: whether all parameters have to be there, and no others
+        :param device: device to load the parameters to
         :raises ModelFileError: the file is damaged, pickled, or of another model
         """
         if not isinstance(load_path_or_dict, dict):

@@ -54,7 +54,7 @@ SelfAlgorithm = TypeVar("SelfAlgorithm", bound="OfflineAlgorithm")
 DECIDED_HERE = DECIDED & set(TrainingOptions.defaults())
 # Episodes that a message shows at most.
 N_EPISODES_SHOWN = 50
-# Windows of which `train/best_of_n_share` is measured: with 32 samples of each, a whole batch took 9 % of the training time.
+# Windows on which `train/best_of_n_share` is measured: a whole batch of 32 samples each took 9 % of the training time.
 N_SHARE_WINDOWS = 64
 
 
@@ -70,7 +70,7 @@ class OfflineAlgorithm(SequenceModel):
         :class:`~sb3_dtfm.envs.ReturnToGoWrapper` where it is not yet; a vectorised one has to be wrapped inside
     :param dataset: Minari id or dataset, path of a file or folder, or data in memory; see
         :func:`~sb3_dtfm.data.load_dataset`
-    :param learning_rate: AdamW's, a number or a function of the progress remaining (from 1 to 0)
+    :param learning_rate: AdamW's learning rate, a number or a function of the progress remaining (from 1 to 0)
     :param dataset_kwargs: further arguments of :func:`~sb3_dtfm.data.load_dataset`: `{"cache_dir": folder}` for datasets
         larger than memory, `{"fraction": 0.5}` for a random half of the episodes, `{"env_id": id}` for data that were
         recorded under another environment's name, and the reader's own, for example `{"filter_key": "train"}` for robomimic.
@@ -82,7 +82,7 @@ class OfflineAlgorithm(SequenceModel):
     :param verbose: 0 silent, 1 prints the log
     :param seed: seed of weights, batches and acting
     :param device: "auto", "cpu" or "cuda"
-    :param _init_setup_model: build the network at once
+    :param _init_setup_model: whether to build the network at once
     :ivar target_return: target return for acting, environment reward units: the environment's, or where it has none the mean
         return of the best tenth of the recorded episodes, which `sb3-dtfm inspect` suggests. It is saved with the model, and
         given to each environment of the model that is wrapped without a target. None if a file does not tell
@@ -131,11 +131,11 @@ class OfflineAlgorithm(SequenceModel):
         super().__init__(policy, env, options, learning_rate, policy_kwargs, tensorboard_log, verbose, seed, device)
         self.dataset = dataset
         self.dataset_kwargs = dataset_kwargs
-        self.time_limit: int | None = None  # of the newest environment that it learned for
+        self.time_limit: int | None = None  # longest episode of the newest environment that it learned for
         self.decisions: list[Decision] = []
         self._training_seconds, self._timed_steps = 0.0, 0
         self._current_learning_rate = 0.0
-        self._training_seed: int | None = None  # where `seed` is None
+        self._training_seed: int | None = None  # drawn where `seed` is None
         if _init_setup_model:
             self._check_arguments(learning_rate=POSITIVE)
             buffer = self._read_dataset()
@@ -154,7 +154,7 @@ class OfflineAlgorithm(SequenceModel):
                 self.policy.critic.set_scale(buffer.largest_discounted_return(self.policy.options.gamma))
 
     def _decide(self, buffer: TrajectoryBuffer) -> None:
-        """Have the data decide of the arguments what the user has left open; they are saved with the others."""
+        """Have the data decide the arguments that the user has left open; they are saved with the others."""
         given = self.policy_kwargs or {}
         names = self._policy_class.parameter_names() | {name for name in DECIDED_HERE if getattr(self, name) is None}
         self.decisions = decide_open(buffer, names, given)
@@ -174,7 +174,7 @@ class OfflineAlgorithm(SequenceModel):
         self._load_buffer()
 
     def _load_buffer(self) -> TrajectoryBuffer:
-        """The dataset of a model whose settings stand, as it is learned from."""
+        """Read the dataset of a model whose settings are decided, to learn from it."""
         return self._learn_from(self._read_dataset())
 
     def _read_dataset(self) -> TrajectoryBuffer:
@@ -213,7 +213,7 @@ class OfflineAlgorithm(SequenceModel):
         """
         Learn from these episodes from now on.
 
-        :return: them, with the returns-to-go that the model is conditioned on
+        :return: the episodes, with the returns-to-go that the model is conditioned on
         """
         n_steps = self.policy.options.expected_return_steps
         if n_steps:
@@ -279,18 +279,18 @@ class OfflineAlgorithm(SequenceModel):
 
         Several processes all call this alike; callbacks run on process 0, which stops all when a callback stops it.
 
-        :param total_timesteps: gradient steps
+        :param total_timesteps: number of gradient steps
         :param callback: SB3 callback or list of callbacks
-        :param log_interval: gradient steps between two logs, None for none
+        :param log_interval: number of gradient steps between two logs, None for no logs
         :param tb_log_name: name of the run in TensorBoard, the algorithm's by default
-        :param reset_num_timesteps: count from zero, otherwise go on counting
-        :param progress_bar: show one
+        :param reset_num_timesteps: whether timesteps are counted from zero; otherwise their count goes on
+        :param progress_bar: whether to show a progress bar
         :return: the model
         :raises ValueError: no dataset, an argument out of range, or a callback that evaluates in an environment which is not
             wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
         :raises FloatingPointError: the loss or its gradient is no longer finite, with the step, its episodes and the last
             checkpoint; such a step changes no weight
-        :raises MemoryError: a gradient step needs more than there is, with what decides how much that is
+        :raises MemoryError: a gradient step needs more memory than there is; the message names the arguments that decide it
         """
         total_timesteps = whole_timesteps(total_timesteps, reset_num_timesteps)
         buffer = self.buffer or self._load_buffer()
@@ -308,7 +308,7 @@ class OfflineAlgorithm(SequenceModel):
                 print(sentence, flush=True)
         batches = self._batches(buffer, self.batch_size)
         callback.on_training_start(locals(), globals())
-        parallel.broadcast(True)  # which may evaluate for longer than a gradient step's messages wait
+        parallel.broadcast(True)  # callbacks may have evaluated for longer than a gradient step's messages wait
         while self.num_timesteps < total_timesteps:
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
             self.train(batches, parallel)
@@ -337,7 +337,7 @@ class OfflineAlgorithm(SequenceModel):
         )
 
     def train(self, batches: Iterator[Windows], parallel: DataParallel) -> None:
-        """The next gradient step, which the number of those before it decides, and how long it took."""
+        """Take the next gradient step, whose random numbers follow from the number of those before it, and time it."""
         assert self._training_seed is not None
         start = time.perf_counter()
         generator = th.Generator(self.device).manual_seed(step_seed(self._training_seed, self._n_updates, NOISE))
@@ -354,14 +354,14 @@ class OfflineAlgorithm(SequenceModel):
         return ", ".join(f"{name}={value}" for name, value in sizes.items())
 
     def _n_bytes(self) -> int:
-        """Memory of a gradient step, at least: its batch, and what blocks keep to be differentiated."""
+        """Bytes that a gradient step needs at least: for its batch, and for what blocks keep for the backward pass."""
         own, policy = self.policy.options, self.policy
         in_batch = 4 * (policy.observation_dim + policy.action_dim)
         in_blocks = 2 * 8 * own.embed_dim * own.n_layers * own.tokens_per_step  # bfloat16: keys, values and the like
         return self.batch_size * self.context_length * (in_batch + in_blocks // n_processes())
 
     def _n_macs(self) -> int:
-        """Multiplications of a gradient step, forward and twice as many backward, without attention's."""
+        """Multiply-accumulates of a gradient step, forward and twice as many backward, without attention's."""
         return 3 * self.batch_size * self.context_length * self.policy.network.n_macs
 
     def _loss_function(self) -> LossFunction:
@@ -377,7 +377,7 @@ class OfflineAlgorithm(SequenceModel):
 
     def compute_loss(self, batch: Windows, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """
-        :param batch: windows of a buffer, actions in the environment's range, (B, K + H - 1, A) of them
+        :param batch: windows of a buffer, with actions (B, K + H - 1, A) in the environment's range
         :param noise: noise of the batch, by the network's `draw_noise`
         :return: the loss to minimise, and its parts by their logged names
         """
@@ -418,7 +418,7 @@ class OfflineAlgorithm(SequenceModel):
             self.policy.update_ema(min(self.ema_decay, (1 + self._n_updates) / (10 + self._n_updates)))
 
     def _learn_values(self) -> dict[str, th.Tensor]:
-        """The critic's gradient steps, the same on every process; means of what is logged."""
+        """Take the critic's gradient steps, the same on every process, and return means of the values to log."""
         critic, n_steps = self.policy.critic, self.policy.options.critic_steps
         if critic is None:
             return {}
@@ -434,7 +434,7 @@ class OfflineAlgorithm(SequenceModel):
         return {name: total / n_steps for name, total in sums.items()}
 
     def _sample_transitions(self, batch_size: int, generator: th.Generator) -> Transitions:
-        """Data of the critic."""
+        """Draw data for the critic."""
         assert self.buffer is not None
         return self.buffer.sample_transitions(batch_size, self.policy.critic_horizon, self.policy.options.gamma, generator)
 
@@ -449,7 +449,7 @@ class OfflineAlgorithm(SequenceModel):
         return self.num_timesteps, 1.0 - self._current_progress_remaining
 
     def _choose_training_seed(self) -> int:
-        """The run's seed; one that was drawn stays the model's."""
+        """The run's seed; a drawn one stays the model's."""
         if self.seed is not None:
             return self.seed
         return th.Generator().seed() if self._training_seed is None else self._training_seed
@@ -473,8 +473,8 @@ class OfflineAlgorithm(SequenceModel):
 
     def _check_finite(self, means: dict[str, float], n_steps: int = 1) -> None:
         """
-        :param means: over the newest gradient steps
-        :param n_steps: how many these are
+        :param means: means over the newest gradient steps, by name
+        :param n_steps: number of these steps
         :raises FloatingPointError: the loss or its gradient is no longer finite
         """
         check_finite(means, lambda: self._name_steps(n_steps), self._last_saved)
@@ -506,7 +506,7 @@ class OfflineAlgorithm(SequenceModel):
     def _on_training_windows(
         self, measure: Callable[[Windows, th.Generator], th.Tensor], at_most: int | None = None
     ) -> float:
-        """Something measured on windows of the training data that belong to the step, so that it disturbs nothing."""
+        """Measure on windows of the training data, drawn by the number of the step, so that no other draw changes."""
         assert self.buffer is not None
         generator = th.Generator(self.device).manual_seed(self.num_timesteps)
         n_windows = min(self.batch_size, at_most or self.batch_size)

@@ -28,7 +28,7 @@ def check_structured(name: str, value: Any) -> None:
     """
     Check an attribute of :data:`STRUCTURED` as a file holds it.
 
-    :param name: of the attribute
+    :param name: name of the attribute
     :param value: plain values
     :raises ValueError: names the attribute, what was found and what is accepted
     """
@@ -43,7 +43,7 @@ def check_dataset_kwargs(given: Any) -> None:
     """
     Check options as a file holds them.
 
-    :param given: by name, or None
+    :param given: options by name, or None
     :raises ValueError: names the option, what was found and what is accepted
     """
     if given is None:
@@ -63,7 +63,7 @@ def check_controller_settings(given: Any) -> None:
     """
     Check a controller as a file holds it.
 
-    :param given: see :func:`~sb3_dtfm.envs.robosuite.arm_motion`, or None
+    :param given: settings of the controller, see :func:`~sb3_dtfm.envs.robosuite.arm_motion`, or None
     :raises ValueError: names the setting, what was found and what is accepted
     """
     if given is None:
@@ -84,7 +84,7 @@ def check_text(value: Any, name: str) -> None:
     Refuse control characters, wherever they are, which would change what a terminal shows.
 
     :param value: dictionaries, lists and plain values
-    :param name: for the message
+    :param name: name of the value in the message
     :raises ValueError: text with such characters
     """
     if isinstance(value, Mapping):

@@ -25,7 +25,7 @@ from sb3_dtfm.policies import SequencePolicy
 from sb3_dtfm.policies.images import extractor_name
 
 POLICY, OPTIMIZER, CRITIC_OPTIMIZER = "policy", "policy.optimizer", "policy.critic.optimizer"
-CRITIC_PREFIX = "critic."  # of the names of the critic's tensors among the optimiser's
+CRITIC_PREFIX = "critic."  # begins the names of the critic's tensors among the optimiser's
 SPACES = ("observation_space", "action_space")
 # Attributes that have a form of their own in the file.
 ENCODED = {*SPACES, "policy_class", "learning_rate", "_means"}
@@ -37,9 +37,9 @@ EXTRACTOR, EXTRACTOR_KWARGS, WEIGHTS = "features_extractor_class", "features_ext
 
 class UnsavedSchedule:
     """
-    Stands for a learning rate that is a function, which a file cannot hold: the model acts, and does not learn.
+    Placeholder for a learning rate that is a function, which a file cannot hold: the model acts, and does not learn.
 
-    :param name: of the function
+    :param name: name of the function
     """
 
     def __init__(self, name: str) -> None:
@@ -50,7 +50,7 @@ class UnsavedSchedule:
 
     def check(self) -> None:
         """
-        :raises ValueError: asks for the function
+        :raises ValueError: always; it asks for the function
         """
         raise ValueError(
             f"learning_rate was the function {printable(self.name)} when this model was saved, and files hold no functions: "
@@ -64,7 +64,7 @@ def to_configuration(
     """
     The attributes of a model as JSON.
 
-    :param model: to save
+    :param model: model to save
     :param known: attributes that loading accepts
     :param left_out: attributes not to save
     :param wanted: attributes that the caller asked for by name
@@ -102,7 +102,7 @@ def to_configuration(
 
 
 def _saved_dataset_kwargs(dataset_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Those that a file may hold; the others are named, but for a cache's folder, which is of this machine."""
+    """Keep the arguments that a file may hold; a warning names the others, but for a cache's folder on this machine."""
     kept = {name: value for name, value in dataset_kwargs.items() if name in DATASET_OPTIONS}
     if unsaved := sorted(dataset_kwargs.keys() - kept.keys() - {"cache_dir"}):
         warnings.warn(
@@ -113,10 +113,10 @@ def _saved_dataset_kwargs(dataset_kwargs: Mapping[str, Any]) -> dict[str, Any]:
 
 def saved_policy_kwargs(policy_kwargs: Any) -> Any:
     """
-    Arguments of the policy that a file can hold: of a class for images its name, by which it is entered among the known.
+    Arguments of the policy that a file can hold: a class for images becomes its name, which is entered in `EXTRACTORS`.
 
-    :param policy_kwargs: as they were given
-    :raises ValueError: those of such a class are no plain values, or no plain text, without which no file could be loaded
+    :param policy_kwargs: arguments of the policy as they were given
+    :raises ValueError: arguments of such a class that are no plain values or no plain text, so that no file could be loaded
     """
     if not isinstance(policy_kwargs, dict):
         return policy_kwargs
@@ -151,14 +151,14 @@ def _plain(value: Any) -> Any:
 
 
 def head_name(policies: Mapping[str, type[BasePolicy]]) -> str:
-    """Name of an algorithm in a file: as the head of its policies does, whatever its class is."""
+    """Name of an algorithm in a file: that of its policies' head, whatever its own class is called."""
     policy = policies["MultiInputPolicy"]
     assert issubclass(policy, SequencePolicy)
     return policy.head_class.algorithm
 
 
 def _policy_name(model: BaseAlgorithm) -> str:
-    """The policy's alias; of a user's own class its name, which `load` cannot find by itself."""
+    """The policy's alias, or the name of a user's own class, which `load` cannot find by itself."""
     names = [name for name, policy in model.policy_aliases.items() if policy is model.policy_class]
     return names[0] if names else model.policy_class.__name__
 
@@ -188,7 +188,7 @@ def optimizers(policy: SequencePolicy) -> dict[str, tuple[th.optim.Optimizer, st
 
 
 def optimizer_tensors(policy: SequencePolicy) -> dict[str, th.Tensor]:
-    """The states of its optimisers, by the number of the weight and the name of the moment."""
+    """The states of a policy's optimisers, by the number of the weight and the name of the moment."""
     tensors: dict[str, th.Tensor] = {}
     for optimizer, prefix in optimizers(policy).values():
         states = optimizer.state_dict()["state"]

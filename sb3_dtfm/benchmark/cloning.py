@@ -28,14 +28,14 @@ from sb3_dtfm.zoo.arguments import import_packages
 
 class Cloning:
     """
-    An MLP from observations to actions, which a callback and `evaluate` take for a model of Stable-Baselines3.
+    An MLP from observations to actions, which a callback and `evaluate` treat as a model of Stable-Baselines3.
 
     It learns by the mean squared error of actions scaled to [-1, 1], or by the cross-entropy of Discrete ones, with Adam.
 
-    :param buffer: to learn from
+    :param buffer: recorded episodes to learn from
     :param hidden_sizes: width of each hidden layer
-    :param learning_rate: of Adam
-    :param seed: of weights and batches
+    :param learning_rate: Adam's learning rate
+    :param seed: seed of weights and batches
     """
 
     device = th.device("cpu")
@@ -55,9 +55,9 @@ class Cloning:
 
     def learn(self, n_steps: int, batch_size: int, callback: BaseCallback) -> None:
         """
-        :param n_steps: gradient steps
-        :param batch_size: recorded steps in each
-        :param callback: called before the first gradient step and after each
+        :param n_steps: number of gradient steps
+        :param batch_size: number of recorded steps in each
+        :param callback: callback that runs before the first gradient step and after each
         """
         self._total_timesteps = n_steps
         model: Any = self

@@ -28,17 +28,17 @@ FINAL_STATES = 2_000_000
 PROGRESS = re.compile(r"step (\d+) of (\d+): (.*)\n")
 PROGRESS_INTERVAL = 0.5  # seconds
 TIMED_BLOCKS, TIMED_ACTIONS = 8, 16
-FIRST_KEY = '{"task"'  # with which a line of rows begins
-N_RANDOM_EPISODES = 10  # whose mean return scores 0
+FIRST_KEY = '{"task"'  # begins each line of rows
+N_RANDOM_EPISODES = 10  # their mean return scores 0
 
 
 class Episodes(NamedTuple):
     """
     Results of n episodes, in the order of their seeds.
 
-    :param returns: in environment reward units
-    :param lengths: in environment steps
-    :param successes: None where the task reports none
+    :param returns: returns in environment reward units
+    :param lengths: lengths in environment steps
+    :param successes: whether each episode succeeded; None where the task does not tell
     """
 
     returns: list[float]
@@ -50,8 +50,8 @@ class SeededEpisodes(gym.Wrapper):
     """
     Each episode starts from the seed that was set for it, and after the last one of these the environment rests.
 
-    A vector environment resets by itself and without a seed; what an episode starts from would then depend on those before.
-    And it steps all of its environments, also those that are done. One that rests stands at a start.
+    A vector environment resets by itself and without a seed; the start of an episode would then depend on those before it.
+    It also steps all of its environments, even those that are done. One that rests stands at a start.
 
     The first environment of its kind is reset twice, and a warning says so if it does not start from its seed.
     """
@@ -67,7 +67,7 @@ class SeededEpisodes(gym.Wrapper):
 
     def set_episode_seeds(self, seeds: Sequence[int]) -> None:
         """
-        :param seeds: of the next episodes
+        :param seeds: seeds of the next episodes
         """
         self._seeds = list(seeds)
 
@@ -93,9 +93,9 @@ def make_seeded_envs(env_id: str, settings: dict[str, Any], n_envs: int, subproc
     Environments as RL-Zoo makes them for a training run, in :class:`SeededEpisodes`.
 
     :param env_id: Gymnasium id
-    :param settings: of the run; `env_wrapper`, `vec_env_wrapper` and `env_kwargs` count
-    :param n_envs: side by side
-    :param subprocesses: each in a process of its own
+    :param settings: settings of the run; `env_wrapper`, `vec_env_wrapper` and `env_kwargs` count
+    :param n_envs: number of environments side by side
+    :param subprocesses: whether each environment has a process of its own
     """
     wrappers = settings.get("env_wrapper") or []
     wrappers = [*(wrappers if isinstance(wrappers, list) else [wrappers]), SeededEpisodes]
@@ -114,14 +114,14 @@ def evaluate(
     model: BaseAlgorithm, vec_env: VecEnv, seeds: Sequence[int], after_step: Callable[[int], None] | None = None
 ) -> Episodes:
     """
-    One episode from each seed, acting deterministically.
+    Play one episode from each seed, acting deterministically.
 
     Environment i plays the episodes i, i + n, i + 2n, ... to their ends: each counts once, however long it is.
 
-    :param model: acts
+    :param model: model that acts
     :param vec_env: environments in :class:`SeededEpisodes`
-    :param seeds: one for each episode
-    :param after_step: called with the number of finished episodes after each step
+    :param seeds: seed of each episode
+    :param after_step: function called with the number of finished episodes after each step
     """
     n_envs, n_episodes = vec_env.num_envs, len(seeds)
     playing = np.arange(n_envs)  # which episode each environment is in
@@ -153,11 +153,11 @@ def action_ms(model: BaseAlgorithm, vec_env: VecEnv, seed: int) -> float:
     """
     Milliseconds of an action in one environment: the median of the means over blocks of actions, from an episode's start on.
 
-    A mean, since of a chunk that is carried out only the first action takes time; a median, since other jobs interrupt.
+    Only the first action of an executed chunk takes time, hence the means; other jobs interrupt, hence the median.
 
-    :param model: acts deterministically
+    :param model: model that acts, deterministically
     :param vec_env: environments in :class:`SeededEpisodes`, the first of which acts
-    :param seed: of the episode
+    :param seed: seed of the episode
     """
     for i in range(vec_env.num_envs):
         vec_env.env_method("set_episode_seeds", [seed] * (TIMED_BLOCKS * TIMED_ACTIONS if i == 0 else 0), indices=i)
@@ -182,13 +182,13 @@ class EvaluationCallback(BaseCallback):
     A YAML file of RL-Zoo may name it under `callback:`; all arguments are plain data.
 
     :param rows: JSONL file to append to
-    :param row: what all rows say: the run, `settings` and `data`, see :mod:`~sb3_dtfm.benchmark.rows`
-    :param eval_freq: gradient steps between two evaluations
-    :param n_episodes: episodes of each
-    :param n_final_episodes: episodes of the last one, on the other initial states
-    :param n_envs: environments side by side
-    :param subprocesses: each in a process of its own
-    :ivar on_evaluation_step: called after each step of an evaluation but the first two; an exception of it ends the
+    :param row: content that all rows share: the run, `settings` and `data`, see :mod:`~sb3_dtfm.benchmark.rows`
+    :param eval_freq: number of gradient steps between two evaluations
+    :param n_episodes: number of episodes of each
+    :param n_final_episodes: number of episodes of the last one, on the other initial states
+    :param n_envs: number of environments side by side
+    :param subprocesses: whether each environment has a process of its own
+    :ivar on_evaluation_step: function called after each step of an evaluation but the first two; an exception of it ends the
         evaluation, which a resumed run repeats
     """
 
@@ -221,7 +221,7 @@ class EvaluationCallback(BaseCallback):
     def _on_training_start(self) -> None:
         self._resumed = time.perf_counter()
         if self.num_timesteps == 0:
-            self._own_rows()  # of an attempt that was killed before its first checkpoint, and nothing else
+            self._own_rows()  # rows of an attempt that was killed before its first checkpoint, and nothing else
             self.rows.unlink(missing_ok=True)
             self._evaluate(final=False)
         else:
@@ -242,7 +242,7 @@ class EvaluationCallback(BaseCallback):
         """
         The rows that are there.
 
-        :raises RowError: something else is there
+        :raises RowError: a file that holds something else
         """
         if not self.rows.exists():
             return []
@@ -262,7 +262,7 @@ class EvaluationCallback(BaseCallback):
         return True
 
     def _evaluate_missing(self, rows: Sequence[Row]) -> None:
-        """:param rows: of evaluations that need no repetition"""
+        """:param rows: rows of evaluations that need no repetition"""
         last = self.num_timesteps == self.model._total_timesteps
         there = {row["final"] for row in rows if row["step"] == self.num_timesteps}
         if (last or self.num_timesteps % self.eval_freq == 0) and False not in there:
@@ -305,7 +305,7 @@ class EvaluationCallback(BaseCallback):
         self._resumed = time.perf_counter()
 
     def _random_return(self) -> float:
-        """Mean return of random actions: what scores 0 where the task does not report success."""
+        """Mean return of random actions, which scores 0 where the task does not report success."""
         random: Any = RandomActions(self.vec_env, seed=0)
         seeds = range(FINAL_STATES, FINAL_STATES + N_RANDOM_EPISODES)
         return round(float(np.mean(evaluate(random, self.vec_env, seeds).returns)), 4)

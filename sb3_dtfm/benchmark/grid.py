@@ -41,7 +41,7 @@ def _is_share(value: Any) -> bool:
     return type(value) in (float, int) and 0.0 < value <= 1.0
 
 
-# Keys of an entry of the file of --datasets: what is accepted, and whether a value is.
+# Keys of an entry of the file of --datasets: a description of accepted values, and whether a value is accepted.
 ENTRY: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "task": ("a Gymnasium id", _is_text),
     "dataset": ("a Minari id or the path of a file", _is_text),
@@ -61,11 +61,11 @@ class Job:
     """
     A run and everything that its process needs.
 
-    :param key: its identity
-    :param task: the task and its data
-    :param settings: what its process reads from a YAML file, RL-Zoo's `train` for example
-    :param data: what the rows say of the dataset
-    :param eval_freq: gradient steps between two evaluations
+    :param key: identity of the run
+    :param task: task and its data
+    :param settings: settings that its process reads from a YAML file, RL-Zoo's `train` for example
+    :param data: description of the dataset in the rows
+    :param eval_freq: number of gradient steps between two evaluations
     """
 
     key: RunKey
@@ -90,7 +90,7 @@ def read_tasks(options: argparse.Namespace) -> list[Task]:
     """
     The tasks of the grid with their data.
 
-    :param options: `tasks`, `dataset`, `datasets` and `target_return` count
+    :param options: arguments of the command; `tasks`, `dataset`, `datasets` and `target_return` count
     :raises UsageError: a malformed option or entry, or no task at all
     :raises gymnasium.error.Error: an unknown task; names the nearest one
     """
@@ -219,9 +219,9 @@ def _check_same(key: RunKey, found: Row, wanted: dict[str, Any], options: argpar
     """
     Refuse to take a finished run for one of other settings.
 
-    :param found: its final row
-    :param wanted: its settings now
-    :raises UsageError: names what differs
+    :param found: final row of that run
+    :param wanted: present settings of the run
+    :raises UsageError: settings that differ, by name
     """
     there = {**found["settings"], "n_timesteps": found["step"], "--final-episodes": len(found["returns"])}
     now = {**json.loads(json.dumps(wanted)), "--final-episodes": options.final_episodes}

@@ -54,7 +54,7 @@ def hardware(device: th.device) -> dict[str, Any]:
     """
     The machine that trains, without its name.
 
-    :param device: where the model is
+    :param device: device of the model
     """
     return {
         "cpu": _cpu_name(),
@@ -96,9 +96,9 @@ def describe_data(buffer: TrajectoryBuffer, dataset: str, recorded_from: str | N
     """
     Describe what a dataset was recorded from, and how good that was: the scale of normalised scores.
 
-    :param buffer: its episodes
+    :param buffer: episodes of the dataset
     :param dataset: Minari id, robomimic file or flat arrays
-    :param recorded_from: the agent or demonstrator, read from the dataset's metadata if not given
+    :param recorded_from: agent or demonstrator, read from the dataset's metadata if not given
     :return: dataset (a file without its folder), recorded_from, n_episodes, n_steps; mean_return and success_rate of the
         episodes, best_return and best_success of the best tenth of them; best_return is the mean of all where the start
         decides, as the best had the easiest starts. Success, in [0, 1], is None where the data do not tell

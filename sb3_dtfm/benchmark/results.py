@@ -1,5 +1,5 @@
 """
-Results: what each evaluation came to, as a line of a CSV table or as summed up from a row of `sb3-dtfm benchmark`.
+Results: a summary of each evaluation, from a line of a CSV table or from a row of `sb3-dtfm benchmark`.
 
 A result has means and counts in place of a row's lists of episodes: all that reports need. The fields of a whole run, from
 the commit to the data, stand with its final evaluation alone.
@@ -20,15 +20,15 @@ from sb3_dtfm.files.replacing import replacing
 
 Result = dict[str, Any]
 
-DIGITS = 8  # significant ones of a number
+DIGITS = 8  # significant digits of a number
 
 
 class Column(NamedTuple):
     """
     A column of the table.
 
-    :param key: of a result
-    :param read: from a cell that is not empty
+    :param key: key in a result
+    :param read: function from the text of a cell that is not empty to its value
     :param optional: whether its cells may be empty; "run" where those of final evaluations may not
     """
 
@@ -106,7 +106,7 @@ OF_A_RUN = ("action_ms", "flow_solver", "flow_steps", "commit", "env_id", "data"
 
 
 def summarize(row: Row) -> Result:
-    """Result of an evaluation."""
+    """Summarise the row of an evaluation."""
     returns, lengths, successes = (row[key] for key in ("returns", "lengths", "successes"))
     counts = {
         "n_episodes": len(returns),
@@ -178,7 +178,7 @@ def read_table(path: Path) -> list[Result]:
 
 def _read_line(cells: dict[str, str]) -> Result:
     """
-    :raises RowError: says what is wrong, without file and line
+    :raises RowError: a malformed line; the message is without file and line
     """
     result: Result = {}
     for name, (key, read, optional) in COLUMNS.items():
@@ -199,7 +199,7 @@ def _read_line(cells: dict[str, str]) -> Result:
 
 def read_results(paths: Iterable[str | os.PathLike[str]]) -> dict[str, list[Result]]:
     """
-    Results by study: a folder below one that is named, or a table in it, is a study; what is named itself is the study "".
+    Results by study: a folder below a named one, or a table in it, is a study; files that are named are the study "".
 
     :param paths: tables, files of rows, and folders with `*.csv` in them, or `*.jsonl` in them or below them
     :raises FileNotFoundError: one of them does not exist

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
-# Key of a row: the types that its value may have.
+# Keys of a row, with the types that their values may have.
 KEYS: dict[str, tuple[type, ...]] = {
     **dict.fromkeys(("task", "algo", "profile", "label"), (str,)),
     **dict.fromkeys(("data_share", "wall_s", "steps_per_s"), (float, int)),
@@ -17,7 +17,7 @@ KEYS: dict[str, tuple[type, ...]] = {
     **dict.fromkeys(("flow_solver", "commit"), (str, type(None))),
     **dict.fromkeys(("versions", "hardware", "settings", "data"), (dict,)),
 }
-# A key that earlier rows lack, and the Gymnasium id of a task with another name.
+# Keys that may be missing: one that earlier rows lack, and the Gymnasium id of a task with another name.
 OPTIONAL_KEYS: dict[str, tuple[type, ...]] = {"action_ms": (float, int), "env_id": (str,)}
 EPISODE_KEYS: dict[str, tuple[type, ...]] = {"returns": (float, int), "lengths": (float, int), "successes": (bool,)}
 
@@ -36,11 +36,11 @@ class RunKey(NamedTuple):
     Identity of a training run; rows with equal keys belong to one run.
 
     :param task: name of the task with its data, which is the Gymnasium id where nothing else was said
-    :param data_share: share of its episodes, in (0, 1]
+    :param data_share: share of the task's episodes, in (0, 1]
     :param algo: "dt" or "dtfm", or one of `BASELINES`
-    :param seed: of weights, batches and acting
+    :param seed: seed of weights, batches and acting
     :param profile: name of the settings
-    :param label: name of what else was changed, empty if nothing
+    :param label: name of further changes, empty if there are none
     """
 
     task: str
@@ -73,9 +73,9 @@ def plain_name(text: str) -> str:
 
 def check_row(row: Any) -> Row:
     """
-    The row, if it has exactly the keys and types that it should.
+    Return the row, if it has exactly the keys and types that it should.
 
-    :raises RowError: says what is wrong, without file and line
+    :raises RowError: another row; the message is without file and line
     """
     if not isinstance(row, dict):
         raise RowError(f"holds a {type(row).__name__}, expected an object with the keys {', '.join(KEYS)}.")
@@ -119,7 +119,7 @@ def read_rows(path: Path, torn_end: bool = False) -> list[Row]:
     """
     All rows of one file.
 
-    :param torn_end: leave out what a kill has left of a last line
+    :param torn_end: whether to leave out a last line that was cut off when its process was killed
     :raises RowError: names the line that is wrong
     """
     rows = []

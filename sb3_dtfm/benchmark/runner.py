@@ -1,4 +1,4 @@
-"""Starts the runs of a grid, each as `sb3-dtfm train`, or behaviour cloning, in a process of its own."""
+"""Runs of a grid, each as `sb3-dtfm train`, or behaviour cloning, in a process of its own."""
 
 import argparse
 import contextlib
@@ -37,7 +37,7 @@ PATIENCE = 10.0  # seconds that a process has to end after SIGTERM
 
 class Runner:
     """
-    Keeps `--jobs` runs going until none is left.
+    Runner that keeps `--jobs` runs going until none is left.
 
     :param jobs: runs to start, in this order
     :param options: arguments of `sb3-dtfm benchmark`
@@ -221,17 +221,17 @@ def _bar(name: str, n_steps: int) -> tqdm:
 
 
 def _say(message: str) -> None:
-    """A line that stays."""
+    """Print a line that stays."""
     tqdm.write(message)
     sys.stdout.flush()
 
 
 def run_grid(jobs: Sequence[Job], n_finished: int, options: argparse.Namespace) -> None:
     """
-    Run what is left of a grid, and say what became of it.
+    Run the rest of a grid, and report the outcome.
 
     :param jobs: runs to start
-    :param n_finished: runs that are not started again
+    :param n_finished: number of finished runs, which are not started again
     :param options: arguments of `sb3-dtfm benchmark`
     :raises SystemExit: with code 1 if a run failed or was left to another process, 130 if interrupted
     """

@@ -1,4 +1,4 @@
-"""Settings of a profile for one run: what RL-Zoo's `train` reads from its YAML file."""
+"""Settings of a profile for one run, which RL-Zoo's `train` reads from its YAML file."""
 
 import copy
 import inspect
@@ -33,17 +33,17 @@ class Task(NamedTuple):
     """
     A user's settings of one task beside the profile: an entry of the file of `--datasets`.
 
-    :param name: of the task with its data, by which rows and reports know it
+    :param name: name of the task with its data in rows and reports
     :param dataset: Minari id, robomimic file or flat arrays, None for the profile's
-    :param target_return: in reward units, None for the profile's, or what the data suggest
-    :param recorded_from: the agent or demonstrator, None for what the dataset's metadata say
+    :param target_return: target return in reward units, None for the profile's or the data's suggestion
+    :param recorded_from: agent or demonstrator, None for that in the dataset's metadata
     :param task: Gymnasium id, None where the name is it
-    :param env_kwargs: of `gymnasium.make`, beside the profile's
-    :param dataset_kwargs: of :func:`~sb3_dtfm.data.load_dataset`, beside the profile's
+    :param env_kwargs: arguments of `gymnasium.make`, beside the profile's
+    :param dataset_kwargs: arguments of :func:`~sb3_dtfm.data.load_dataset`, beside the profile's
     :param fraction: share of the dataset's episodes, in (0, 1], that counts as all of them
     :param gym_packages: modules that register the task
-    :param algorithms: those that can learn it, None for all
-    :param chosen_with: a default was chosen with it, so that it does not judge the defaults
+    :param algorithms: algorithms that can learn it, None for all
+    :param chosen_with: whether a default was chosen with it, so that it does not judge the defaults
     """
 
     name: str
@@ -74,7 +74,7 @@ def read_profile(profile: str, algo: str, env_id: str) -> dict[str, Any]:
     Settings of one task, or those for any other.
 
     :param profile: "default", "paper", a YAML file for all algorithms, or a folder with one for each
-    :param algo: for example "dtfm"
+    :param algo: name of the algorithm, for example "dtfm"
     :param env_id: Gymnasium id
     :raises UsageError: no such file, or it holds no settings for the task
     """
@@ -99,14 +99,14 @@ def task_settings(
 
     Settings that only another algorithm knows are left out, so that one file or one `-params` serves all.
 
-    :param profile: see :func:`read_profile`
-    :param algo: for example "dtfm"
-    :param task: the task and its data
-    :param data_share: share of the episodes
-    :param n_timesteps: gradient steps, None for the profile's
-    :param hyperparams: replace the profile's; mappings of keyword arguments replace entry by entry, and options of the
-        policy may stand beside the others
-    :return: with a target return if the command, the file of datasets or the profile, for its own dataset, has one
+    :param profile: name or path of the profile, see :func:`read_profile`
+    :param algo: name of the algorithm, for example "dtfm"
+    :param task: task and its data
+    :param data_share: share of the episodes, in (0, 1]
+    :param n_timesteps: number of gradient steps, None for the profile's
+    :param hyperparams: settings that replace the profile's; mappings of keyword arguments replace entry by entry, and
+        options of the policy may stand beside the others
+    :return: settings, with a target return if the command, the file of datasets or the profile, for its own dataset, has one
     :raises UsageError: settings missing, unknown or not allowed here
     """
     settings = read_profile(profile, algo, task.env_id)
@@ -144,9 +144,9 @@ def cloning_settings(algo: str, settings: Mapping[str, Any], n_timesteps: int | 
     """
     Settings of a run of behaviour cloning.
 
-    :param algo: one of `BASELINES`
-    :param settings: of DT or DTFM, whose data and environment are its own, too
-    :param n_timesteps: gradient steps, None for 5,000
+    :param algo: key of `BASELINES`
+    :param settings: settings of DT or DTFM, whose data and environment it shares
+    :param n_timesteps: number of gradient steps, None for 5,000
     """
     shared = {key: settings[key] for key in CLONING_SHARES if key in settings}
     asked = {} if n_timesteps is None else {"n_timesteps": n_timesteps}
@@ -155,11 +155,11 @@ def cloning_settings(algo: str, settings: Mapping[str, Any], n_timesteps: int | 
 
 def check_same_transformer(settings: dict[str, dict[str, Any]], task: str) -> None:
     """
-    Algorithms may differ in what not all of them know, and in nothing else.
+    Check that algorithms differ only in settings that not all of them know.
 
-    :param settings: by algorithm, of all algorithms
-    :param task: for the message
-    :raises UsageError: names what differs
+    :param settings: settings of all algorithms, by algorithm
+    :param task: name of the task in the message
+    :raises UsageError: a setting that differs, by name
     """
     flat = {algo: {**each, **_mapping(each, "policy_kwargs")} for algo, each in settings.items()}
     common = [set.intersection(*map(of, ALGORITHMS)) for of in (_constructor_parameters, _policy_parameters)]
@@ -172,7 +172,7 @@ def check_same_transformer(settings: dict[str, dict[str, Any]], task: str) -> No
 
 def _mapping(settings: dict[str, Any], key: str) -> dict[str, Any]:
     """
-    :raises UsageError: something else stands there
+    :raises UsageError: a value that is no mapping
     """
     found = settings.get(key) or {}
     if not isinstance(found, dict):
@@ -184,7 +184,7 @@ def _known(settings: dict[str, Any], algo: str, parameters: Callable[[str], set[
     """
     The settings without those that only other algorithms know.
 
-    :raises UsageError: one of them is unknown
+    :raises UsageError: a setting that no algorithm knows
     """
     unknown = set(settings).difference(*map(parameters, ALGORITHMS))
     if unknown:
@@ -198,5 +198,5 @@ def _constructor_parameters(algo: str) -> set[str]:
 
 
 def _policy_parameters(algo: str) -> set[str]:
-    """Keys of its `policy_kwargs`."""
+    """Keys of an algorithm's `policy_kwargs`."""
     return policy_of(algo).parameter_names()

@@ -95,7 +95,7 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
     """
     The user's arguments, in range; `hyperparams` is a mapping with all that changes the profile's settings.
 
-    :raises UsageError: one is not
+    :raises UsageError: an argument out of range
     """
     options = benchmark_parser().parse_args(argv)
     for name in ("n_timesteps", "eval_freq", "eval_episodes", "final_episodes", "n_eval_envs", "jobs"):

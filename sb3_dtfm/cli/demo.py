@@ -53,11 +53,11 @@ def run_demo(folder: Path, n_demonstrations: int, n_steps: int | None, n_episode
     """
     Record, train, evaluate and plot; each stage only if its result is not in the folder.
 
-    :param folder: where everything goes
-    :param n_demonstrations: demonstrations to record; training sees half of them
-    :param n_steps: gradient steps, None for those of the packaged settings
-    :param n_episodes: episodes of the final evaluation
-    :return: what `evaluation.json` holds
+    :param folder: folder of all files
+    :param n_demonstrations: number of demonstrations to record; training sees half of them
+    :param n_steps: number of gradient steps, None for that of the packaged settings
+    :param n_episodes: number of episodes of the final evaluation
+    :return: content of `evaluation.json`
     """
     start = time.monotonic()
     dataset = folder / "lift.hdf5"

@@ -30,7 +30,7 @@ from sb3_dtfm.files import printable
 
 BLUE, RED, GREY = "#1b6ca8", "#c0562b", "0.6"
 ROBOSUITE = "robosuite/"  # begins the ids of its tasks
-# Options that choose among episodes by what they come to.
+# Options that choose among episodes by their results.
 CHOOSING = {"min_return", "best_share", "success_only"}
 # Discrete actions that are counted in the table, the most frequent ones.
 N_CHOICES = 10
@@ -76,7 +76,7 @@ def load(
     A dataset as its task would learn from it: up to the time limit, where the task is known here, and the best of that.
 
     :param dataset: Minari id, file, or several of them
-    :param options: of its reader
+    :param options: options of its reader
     :param env_id: Gymnasium id of the task; None leaves it to the dataset
     :param env_kwargs: arguments of `gymnasium.make` for this task
     :raises DatasetError: the dataset cannot be read, or is not of this task
@@ -143,8 +143,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def table(buffer: TrajectoryBuffer, found: Inspection) -> list[str]:
     """
-    :param buffer: the dataset
-    :param found: in it
+    :param buffer: dataset
+    :param found: inspection of it
     :return: lines of Markdown
     """
     returns, lengths, successes = buffer.episode_returns, buffer.episode_lengths, buffer.successes
@@ -169,7 +169,7 @@ def table(buffer: TrajectoryBuffer, found: Inspection) -> list[str]:
 
 def dimensions(found: Range) -> list[str]:
     """
-    :param found: in the observations
+    :param found: range of the observations
     :return: lines of Markdown, one for each of the first dimensions
     """
     rows = zip(found.low[:N_DIMENSIONS], found.high, found.mean, found.std, strict=False)
@@ -188,10 +188,10 @@ def loading(
     env_kwargs: Mapping[str, Any] = MappingProxyType({}),
 ) -> list[str]:
     """
-    :param dataset: as for :func:`load`
-    :param options: as for :func:`load`
-    :param env_id: as for :func:`load`
-    :param env_kwargs: as for :func:`load`
+    :param dataset: dataset, as for :func:`load`
+    :param options: options of its reader
+    :param env_id: Gymnasium id of the task, None for no environment
+    :param env_kwargs: arguments of `gymnasium.make` for this task
     :return: lines of Python, the last of which reads the dataset
     """
     lines, known = [], {}
@@ -238,13 +238,13 @@ def command(
     found: Inspection,
 ) -> str:
     """
-    A training of this dataset.
+    Command of a training on this dataset.
 
-    :param datasets: as given
-    :param dataset_kwargs: as given
-    :param gym_packages: as given
-    :param buffer: the dataset
-    :param found: in it
+    :param datasets: datasets as the user gave them
+    :param dataset_kwargs: options of their reader as the user gave them
+    :param gym_packages: packages as the user gave them
+    :param buffer: dataset
+    :param found: inspection of it
     """
     algo = "dtfm" if isinstance(buffer.action_space, spaces.Box) else "dt"
     words = ["sb3-dtfm", "train", "--algo", algo, "--env", buffer.env_id or "TASK"]
@@ -264,8 +264,8 @@ def draw(buffer: TrajectoryBuffer, found: Inspection, output: Path, title: str) 
     """
     Draw returns, lengths, rewards over time, the actions' ranges, and what each camera saw in the first episode.
 
-    :param buffer: the dataset
-    :param found: in it
+    :param buffer: dataset
+    :param found: inspection of it
     :param output: PNG file to write
     :param title: heading
     :return: `output`
@@ -313,7 +313,7 @@ def _draw_images(figure: Any, buffer: TrajectoryBuffer) -> None:
 
 
 def _draw_actions(axis: Any, space: ActionSpace, found: Range) -> None:
-    """The range that is used of each dimension, or how often each of the Discrete actions was chosen."""
+    """Draw the used range of each dimension, or how often each of the Discrete actions was chosen."""
     dimensions = np.arange(len(found.low))
     if isinstance(space, spaces.Discrete):
         axis.bar(space.start + dimensions, found.mean, color=BLUE)

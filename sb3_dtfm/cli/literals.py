@@ -10,7 +10,7 @@ def key_value(text: str) -> tuple[str, Any]:
     """
     An argument as RL-Zoo spells it, `key:value`, with a literal of Python as value.
 
-    :raises argparse.ArgumentTypeError: it is none
+    :raises argparse.ArgumentTypeError: another text
     """
     key, _, value = text.partition(":")
     try:

@@ -34,7 +34,7 @@ def main(argv: Sequence[str]) -> None:
 
 def _new_run(options: argparse.Namespace) -> Path:
     """
-    :raises UsageError: it is there already
+    :raises UsageError: a run that is there already
     """
     runs = Path(options.folder, options.algo)
     run = runs / f"{options.env}_{options.exp_id or get_latest_run_id(str(runs), options.env) + 1}"

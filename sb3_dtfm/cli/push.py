@@ -43,12 +43,12 @@ def main(argv: Sequence[str]) -> None:
 
 def write_repository(folder: Path, repo_id: str, model: FoundModel, options: argparse.Namespace) -> None:
     """
-    All that is uploaded.
+    Write everything that is uploaded.
 
-    :param folder: to write into
+    :param folder: folder to write into
     :param repo_id: organisation/name
-    :param model: of a run
-    :param options: of the command
+    :param model: model of a run
+    :param options: arguments of the command
     """
     env_name: EnvironmentName = options.env
     hyperparams = read_run(Path(model.run, env_name))
@@ -65,11 +65,11 @@ def write_repository(folder: Path, repo_id: str, model: FoundModel, options: arg
 
 def evaluate(model: FoundModel, agent: AgentFiles, options: argparse.Namespace) -> hub.Result:
     """
-    Episodes of the model as its file has it.
+    Evaluate the model as its file has it.
 
-    :param model: of the run
-    :param agent: what its environment was in training
-    :param options: of the command
+    :param model: model of the run
+    :param agent: the model's files, which say what its environment was in training
+    :param options: arguments of the command
     """
     env = make_vec_env(options.env.gym_id, seed=options.seed, env_kwargs=agent.env_kwargs, wrapper_class=agent.wrapper)
     try:
@@ -82,7 +82,7 @@ def evaluate(model: FoundModel, agent: AgentFiles, options: argparse.Namespace) 
 
 
 def _write_video(path: Path, model: FoundModel, options: argparse.Namespace) -> bool:
-    """Return whether this machine can."""
+    """Write a video, and return whether this machine can draw one."""
     arguments = [
         "--algo",
         options.algo,
@@ -103,7 +103,7 @@ def _write_video(path: Path, model: FoundModel, options: argparse.Namespace) -> 
 
 @contextlib.contextmanager
 def _folder(given: Path | None) -> Iterator[Path]:
-    """The given one, or one that is gone in the end."""
+    """The given folder, or one that is gone in the end."""
     if given is not None:
         given.mkdir(parents=True, exist_ok=True)
         yield given

@@ -25,11 +25,11 @@ from sb3_dtfm.recording.loading import AgentFiles, algorithm_of, find_agent, loa
 from sb3_dtfm.zoo.arguments import UsageError, at_least, import_packages, key_values
 
 COLORS = ("#1b6ca8", "#c0562b", "#3f8f5f", "#7b5ea7")
-# First seed of the initial states: apart from those of recordings and benchmarks.
+# First seed of the initial states, apart from those of recordings and benchmarks.
 FIRST_STATE = 4_000_000
-# Between the initial states of two seeds.
+# Distance between the first initial states of two seeds.
 SEED_STRIDE = 10_000
-# Means differ if chance makes them as different this seldom. With fewer episodes for each return chance is not told apart.
+# Largest p-value at which means differ, shuffles of the test, and fewest episodes for each return that can show it.
 SIGNIFICANT, N_SHUFFLES, FEWEST_EPISODES = 0.05, 1_999, 6
 
 
@@ -37,9 +37,9 @@ class Reached(NamedTuple):
     """
     Episodes of a model with one target return.
 
-    :param target: in environment reward units
-    :param returns: (n,) what the episodes reached
-    :param successes: (n,) whether they solved the task; None where it reports none
+    :param target: target return in environment reward units
+    :param returns: returns (n,) of the episodes, environment reward units
+    :param successes: whether each episode (n,) solved the task; None where the task does not tell
     """
 
     target: float
@@ -139,8 +139,8 @@ def _parser() -> argparse.ArgumentParser:
 def set_acting(model: BaseAlgorithm, choices: dict[str, Any]) -> None:
     """
     :param model: DT or DTFM
-    :param choices: of :meth:`SequencePolicy.set_acting`, for all models
-    :raises UsageError: one that the model does not have, or a value out of range
+    :param choices: arguments of :meth:`SequencePolicy.set_acting`, for all models
+    :raises UsageError: a setting that the model does not have, or a value out of range
     """
     try:
         model.policy.set_acting(**choices)  # type: ignore[operator]
@@ -150,9 +150,9 @@ def set_acting(model: BaseAlgorithm, choices: dict[str, Any]) -> None:
 
 def evenly(returns: np.ndarray, n: int) -> list[float]:
     """
-    :param returns: (E,) of the recorded episodes
-    :param n: how many numbers
-    :return: from the smallest to the largest, four digits each; fewer where they do not differ by as much
+    :param returns: returns (E,) of the recorded episodes
+    :param n: number of target returns
+    :return: target returns from the smallest to the largest, four digits each; fewer where they do not differ by as much
     """
     return np.unique([float(f"{each:.4g}") for each in np.linspace(returns.min(), returns.max(), n)]).tolist()
 
@@ -163,7 +163,7 @@ def _env_kwargs(agent: AgentFiles, options: argparse.Namespace) -> dict[str, Any
 
 
 def _wrapper(agent: AgentFiles) -> Callable[[gym.Env], gym.Env]:
-    """Wrapper of an agent's environment; targets follow."""
+    """Wrapper of an agent's environment; its target return is set later."""
     return agent.wrapper or ReturnToGoWrapper
 
 
@@ -173,11 +173,11 @@ def sweep(
     """
     Play episodes from the same initial states for each return.
 
-    :param model: acts
-    :param agent: says what its environment was in training
-    :param options: of the command
+    :param model: model that acts
+    :param agent: the model's files, which say what its environment was in training
+    :param options: arguments of the command
     :param targets: target returns, environment reward units
-    :param progress: counts episodes
+    :param progress: progress bar that counts episodes
     """
     vec_env = make_vec_env(
         options.env,
@@ -221,7 +221,7 @@ def first_state(options: argparse.Namespace) -> int:
 
 def table(curves: dict[str, list[Reached]]) -> list[str]:
     """
-    :param curves: what each model reached, by its name
+    :param curves: episodes of each model for each target return, by the model's name
     :return: lines of Markdown: mean return and its 95 % interval, and how many episodes solved the task if it reports that
     """
     lines = [f"| target return | {' | '.join(curves)} |", f"| --- |{' --- |' * len(curves)}"]
@@ -241,8 +241,8 @@ def finding(reached: Sequence[Reached]) -> str:
     """
     Say whether the target return has an effect, and which is the best one.
 
-    :param reached: for each of two or more returns, as many episodes
-    :return: a sentence
+    :param reached: episodes for each of two or more target returns, the same number for each
+    :return: sentence
     """
     returns = np.array([each.returns for each in reached])
     n_episodes, means = returns.shape[1], returns.mean(axis=1)
@@ -262,7 +262,7 @@ def chance(returns: np.ndarray) -> float:
     """
     A permutation test of the means against the spread between episodes, be it by their initial states or not.
 
-    :param returns: (R, E) for each of R target returns, of E episodes
+    :param returns: returns (R, E) of E episodes for each of R target returns
     :return: share of the ways to shuffle all returns by which the R means differ at least as much, in (0, 1]
     """
     rng = np.random.default_rng(0)
@@ -275,7 +275,7 @@ def draw(curves: dict[str, list[Reached]], recorded: np.ndarray, output: Path, t
     """
     Draw reached returns over target returns, above the returns of the recorded episodes.
 
-    :param curves: as for :func:`table`
+    :param curves: episodes of each model, as for :func:`table`
     :param recorded: (E,) returns of the dataset's episodes
     :param output: PNG file to write
     :param title: heading

@@ -24,7 +24,7 @@ from sb3_dtfm.finetuning.online_actor import (
 from sb3_dtfm.finetuning.residual_env import ResidualActionVecEnv
 from sb3_dtfm.policies import DTFMPolicy, SequencePolicy
 
-# Its name in commands and folders of runs.
+# Name of fine-tuned models in commands and folders of runs.
 FINETUNED = "finetuned"
 # Classes whose actors can be taken over, by whether they squash their actions by tanh; sb3-contrib is an extra.
 SQUASHED = {"SAC": True, "TQC": True, "PPO": False, "A2C": False, "TRPO": False}
@@ -37,7 +37,7 @@ class FinetunedPolicy(DTFMPolicy):
         """
         Let an online actor choose from now on; its weights are for the caller to load.
 
-        :param settings: of :class:`~sb3_dtfm.finetuning.online_actor.OnlineActor`; None draws noise again
+        :param settings: settings of :class:`~sb3_dtfm.finetuning.online_actor.OnlineActor`; None draws noise again
         :raises ValueError: the head starts from no noise, or a setting out of range
         """
         if settings is None:
@@ -103,12 +103,12 @@ class FinetunedDTFM(SequenceModel):
         """
         A copy of a model, with an agent's actor.
 
-        :param model: stays as it is
-        :param agent: see :meth:`take_actor`; None for no actor
+        :param model: model to copy, which stays as it is
+        :param agent: agent whose actor is taken, see :meth:`take_actor`; None for no actor
         :raises ValueError: an actor that cannot be taken over
         """
         file = io.BytesIO()
-        model.save(file, exclude=set(vars(model)) - KNOWN)  # a subclass's own
+        model.save(file, exclude=set(vars(model)) - KNOWN)  # without a subclass's own attributes
         finetuned = cls.load(file, device=model.device)
         finetuned.policy.optimizer.state.clear()  # it learns no more: half of the file
         if agent is not None:
@@ -143,7 +143,7 @@ def _take_over(agent: BaseAlgorithm) -> tuple[dict[str, Any], dict[str, th.Tenso
     """
     An actor as settings and weights of :class:`~sb3_dtfm.finetuning.online_actor.OnlineActor`.
 
-    :raises ValueError: one that has another form
+    :raises ValueError: an actor of another form
     """
     name = next((each.__name__ for each in type(agent).__mro__ if each.__name__ in SQUASHED), None)
     if name is None:

@@ -32,7 +32,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
     :param venv: environments wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
     :param model: a DTFM, or the path to a saved one
     :param bound: largest absolute value of a choice
-    :param hidden_state: show the Transformer's hidden state as well
+    :param hidden_state: whether observations hold the Transformer's hidden state, too
     :raises ValueError: a model that has an online actor already or does not fit, environments that do not fit, or an
         argument out of range
     """
@@ -81,13 +81,13 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
         """
         Actions that follow from a choice.
 
-        :param actions: (B, ...), of the action space
+        :param actions: choices (B, ...) in the action space
         :return: actions (B, n_action_steps, A) in the environment's range, and the context with them
         """
         raise NotImplementedError
 
     def _show(self, context: Context, hidden: th.Tensor) -> np.ndarray:
-        """:return: (B, F), what is observed of rows that have not acted"""
+        """:return: observations (B, F) of rows that have not acted"""
         with th.inference_mode():
             newest = Windows(*(th.from_numpy(each[:, -1:]).to(hidden.device) for each in context.windows))
             shown = actor_observation(self.policy.normalization, newest, hidden if self.hidden_state else None)
@@ -95,7 +95,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
 
     @property
     def policy(self) -> SequencePolicy:
-        """The frozen one."""
+        """The frozen policy."""
         return self.model.policy
 
     def reset(self) -> VecEnvObs:
@@ -105,7 +105,7 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
 
     def step_async(self, actions: np.ndarray) -> None:
         """
-        :param actions: (B, ...), of the action space
+        :param actions: choices (B, ...) in the action space
         """
         assert self._known is not None, "reset() comes before step()"
         chosen, self._acted = self._act(*self._known, actions)
@@ -131,9 +131,9 @@ class FrozenPolicyVecEnv(VecEnvWrapper):
 
         Rows whose episode ended earlier stay where they were; their context is not needed any more.
 
-        :param context: of b rows that have acted
-        :param between: for each row what was observed between its actions
-        :param n_steps: how often the others observed
+        :param context: context of b rows that have acted
+        :param between: observations of each row between its actions, by key
+        :param n_steps: number of these observations in rows whose episode went on
         """
         vectors = context.observations[:, -1, : self.policy.vector_dim].copy()
         newest = {OBSERVATION: vectors, RETURN_TO_GO: context.returns_to_go[:, -1:].copy()}

@@ -21,12 +21,12 @@ NOISE_SPACE_FLOW_STEPS = 3
 
 class NoiseSpace(spaces.Box):
     """
-    Noise within a bound. Samples are standard normal, cut off there: what the frozen policy was trained with.
+    Noise within a bound. Samples are standard normal, clipped to it: the noise that the frozen policy was trained with.
 
-    Stable-Baselines3's off-policy algorithms sample their first actions, so what they explore with is the frozen policy.
+    Stable-Baselines3's off-policy algorithms sample their first actions, so they explore with the frozen policy.
 
-    :param noise_dim: N
-    :param bound: largest absolute value
+    :param noise_dim: number N of noise values
+    :param bound: largest absolute value of the noise
     :param seed: seed of the samples
     """
 
@@ -34,7 +34,7 @@ class NoiseSpace(spaces.Box):
         super().__init__(-bound, bound, (noise_dim,), np.float32, seed)
 
     def sample(self, mask: None = None, probability: None = None) -> np.ndarray:
-        """:return: (N,)"""
+        """:return: noise (N,)"""
         return self.np_random.standard_normal(self.shape, np.float32).clip(self.low, self.high)
 
 
@@ -50,7 +50,7 @@ class NoiseActionVecEnv(FrozenPolicyVecEnv):
     :param venv: environments wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
     :param model: a DTFM, or the path to a saved one
     :param bound: largest absolute noise
-    :param hidden_state: show the Transformer's hidden state as well
+    :param hidden_state: whether observations hold the Transformer's hidden state, too
     :raises ValueError: a policy whose actions do not depend on noise (DT, and one step of Euler, which ends at the mean
         action), environments that do not fit it, or an argument out of range
     """

@@ -50,9 +50,9 @@ class Step(NamedTuple):
     A step of all environments.
 
     :param observations: (B, O), as the environments gave them
-    :param actions: (B, A) in their range, or (B,) of choices
-    :param rewards: (B,)
-    :param images: (B, channels, height, width) by camera, or channels last
+    :param actions: (B, A) in the environments' range, or choices (B,)
+    :param rewards: rewards (B,), environment reward units
+    :param images: images by camera, (B, channels, height, width) or channels last
     """
 
     observations: np.ndarray
@@ -73,7 +73,7 @@ class OnlineDTFM(DTFM):
     `learn(total_timesteps)` counts the environments' steps, as online algorithms do. The model stays a DTFM and is saved as
     one: `OnlineDTFM.load("can.zip", env, dataset="can.hdf5")` goes on from a DTFM, and `DTFM.load` reads what it saves.
 
-    :param n_episodes: own episodes of a round, of all environments together
+    :param n_episodes: number of own episodes in a round, of all environments together
     :param gradient_steps: number of gradient steps in a round, over which `learning_rate_schedule` and `warmup_steps` go
     :ivar replay_buffer: all own episodes, None before the first ones
     """
@@ -84,10 +84,10 @@ class OnlineDTFM(DTFM):
         self.n_episodes = n_episodes
         self.gradient_steps = gradient_steps
         self.replay_buffer: TrajectoryBuffer | None = None
-        self._running: list[Step] = []  # of the episodes that have not ended
-        self._began: list[int] = []  # where each environment's episode begins in them
-        self._state: tuple[np.ndarray, ...] | None = None  # of acting
-        self._n_left = 0  # of a round's gradient steps
+        self._running: list[Step] = []  # steps of the episodes that have not ended
+        self._began: list[int] = []  # step in them at which each environment's episode begins
+        self._state: tuple[np.ndarray, ...] | None = None  # the policy's state while acting
+        self._n_left = 0  # gradient steps left of a round
         super().__init__(*args, **kwargs)
 
     def _check_arguments(self, learning_rate: Rule) -> None:
@@ -95,7 +95,7 @@ class OnlineDTFM(DTFM):
         vars(self).update(check_arguments(vars(self), ACCEPTED))
 
     def _excluded_save_params(self) -> list[str]:
-        """Add what is kept in a file of its own, or belongs to the environments."""
+        """Add the attributes that have a file of their own, or belong to the environments."""
         return [*super()._excluded_save_params(), "replay_buffer", "_running", "_began", "_state"]
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
@@ -127,12 +127,12 @@ class OnlineDTFM(DTFM):
         """
         Act and learn in rounds; callbacks run once after each step of the environments.
 
-        :param total_timesteps: steps of all environments together
+        :param total_timesteps: number of steps of all environments together
         :param callback: SB3 callback or list of callbacks
-        :param log_interval: rounds between two logs, None for none
+        :param log_interval: number of rounds between two logs, None for no logs
         :param tb_log_name: name of the run in TensorBoard, the algorithm's by default
-        :param reset_num_timesteps: count from zero, otherwise go on counting
-        :param progress_bar: show one
+        :param reset_num_timesteps: whether timesteps are counted from zero; otherwise their count goes on
+        :param progress_bar: whether to show a progress bar
         :return: the model
         :raises ValueError: no dataset, no environment, or an argument out of range
         :raises FloatingPointError: the loss or its gradient is no longer finite; such a step changes no weight
@@ -149,11 +149,11 @@ class OnlineDTFM(DTFM):
         parallel = DataParallel(self.policy, self._loss_function(), self.batch_size)
         self._training_seed = self._choose_training_seed()
         callback.on_training_start(locals(), globals())
-        if self._n_left and self.replay_buffer is not None:  # of a round that was interrupted
+        if self._n_left and self.replay_buffer is not None:  # the rest of a round that was interrupted
             self._imitate(parallel, min(self._n_left, self.gradient_steps))
         n_rounds = 0
         while self.num_timesteps < total_timesteps:
-            # At the beginning of a round: it ends with an episode, and the last one so beyond the steps that were asked for.
+            # Before a round: rounds end with an episode, so the last one goes beyond the steps that were asked for.
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
             if not self._collect(callback):
                 break
@@ -249,7 +249,7 @@ class OnlineDTFM(DTFM):
         Take up own episodes of an earlier run.
 
         :param path: path that :meth:`save_replay_buffer` was given
-        :param truncate_last_traj: SB3's; episodes that had not ended are not there
+        :param truncate_last_traj: SB3's argument, which changes nothing: episodes that had not ended are not in the file
         :raises DatasetError: it cannot be read, or does not fit the model
         """
         path = with_npz(path)
@@ -260,9 +260,9 @@ class OnlineDTFM(DTFM):
 
     def _imitate(self, parallel: DataParallel, n_steps: int) -> None:
         """
-        The gradient steps of a round; what acting has kept of the old weights' keys and values goes.
+        Take the gradient steps of a round, and drop the keys and values that acting has cached with the old weights.
 
-        :param n_steps: less than `gradient_steps` where others have been taken before an interrupt
+        :param n_steps: number of gradient steps, less than `gradient_steps` where some were taken before an interrupt
         """
         batches = self._imitated()
         self._n_left = n_steps
@@ -274,7 +274,7 @@ class OnlineDTFM(DTFM):
             self._state = tuple(context._replace(keys_values=np.zeros((len(context.mask), 0), np.float32)))
 
     def _imitated(self) -> Iterator[Windows]:
-        """Batches of the dataset and of the own episodes that are worth it."""
+        """Batches of the dataset and of the own episodes that are worth imitating."""
         assert self.buffer is not None
         assert self.replay_buffer is not None
         average = np.concatenate([self.buffer.episode_returns, self.replay_buffer.episode_returns]).mean()

@@ -1,7 +1,7 @@
 """
-OnlineActor: what an online algorithm has learned to choose of how a flow acts.
+OnlineActor: the choices that an online algorithm has learned to make for a flow.
 
-Its noise, in place of drawn noise (Wagenmaker et al., 2025), or residual actions (Johannink et al., 2019).
+These are noise in place of drawn noise (Wagenmaker et al., 2025), or residual actions (Johannink et al., 2019).
 """
 
 from collections.abc import Callable
@@ -33,14 +33,14 @@ ACCEPTED: dict[str, Rule] = {
 
 def actor_observation(normalization: Normalization, newest: Windows, hidden: th.Tensor | None) -> th.Tensor:
     """
-    The observation of an online actor: all that the frozen policy's newest step depends on, but for the steps before it.
+    The observation of an online actor: everything that the frozen policy's newest step depends on but the steps before it.
 
     Observations are in standard deviations of the training data, also with `observation_scaling="robust"`: the units that an
     ordinary network learns from, as behind SB3's `VecNormalize`.
 
-    :param normalization: of the policy
-    :param newest: (B, 1, ...), in the environment's units
-    :param hidden: (B, D) of the Transformer; None leaves it out
+    :param normalization: the policy's normalization
+    :param newest: newest steps (B, 1, ...), in the environment's units
+    :param hidden: the Transformer's hidden states (B, D); None leaves them out
     :return: (B, O + 2), or (B, O + 2 + D), each within `OBSERVATION_CLIP`: observation, the Transformer's return-to-go,
         time step as a share of the longest episode that was learned from
     """
@@ -58,14 +58,15 @@ class OnlineActor(nn.Module):
     """
     A Gaussian actor over noise, or over residual actions, in a form that holds those of several algorithms.
 
-    :param observation_dim: F, what it sees
-    :param chosen_dim: what it chooses: N numbers of noise, or A of an action
+    :param observation_dim: size F of the actor's observation
+    :param chosen_dim: size of a choice: N for noise, or A for a residual action
     :param layers: widths of the hidden layers
     :param activation: a key of `ACTIVATIONS`
-    :param squashed: it chooses bound * tanh(...), as SAC's and TQC's actions; otherwise clipped to the bound, as PPO's
+    :param squashed: whether choices are bound * tanh(...), as SAC's and TQC's actions; otherwise they are clipped, as PPO's
     :param bound: largest absolute noise, or residual action in units of [-1, 1]
-    :param hidden_state: the Transformer's hidden state is part of what it sees
-    :param residual: it adds residual actions, and sees the policy's own behind the rest; otherwise it chooses noise
+    :param hidden_state: whether the Transformer's hidden state is part of the observation
+    :param residual: whether it chooses residual actions, and observes the policy's own action last; otherwise it chooses
+        noise
     :raises ValueError: an argument out of range, by name
     """
 
@@ -99,8 +100,8 @@ class OnlineActor(nn.Module):
     def choose(self, observation: th.Tensor, drawn: th.Tensor) -> th.Tensor:
         """
         :param observation: (B, F)
-        :param drawn: (B, N), standard normal; of zeros the mean is chosen
-        :return: what is chosen (B, N), of the actor's distribution
+        :param drawn: standard normal noise, (B, N) or (B, A); zeros give the mean
+        :return: choices, shaped like `drawn`, of the actor's distribution
         """
         latent = self.layers(observation)
         chosen = self.mean(latent) + self.log_std(latent).clamp(*LOG_STD_RANGE).exp() * drawn
@@ -115,14 +116,14 @@ class OnlineActor(nn.Module):
         decode: Callable[[th.Tensor], th.Tensor],
     ) -> th.Tensor:
         """
-        Noise is of the actor's distribution, a residual action its mean, and only the first action has one.
+        Noise is drawn from the actor's distribution; a residual action is its mean, and only the first action gets one.
 
-        :param normalization: of the policy
-        :param newest: (B, 1, ...), in the environment's units
-        :param hidden: (B, D) of the Transformer
+        :param normalization: the policy's normalization
+        :param newest: newest steps (B, 1, ...), in the environment's units
+        :param hidden: the Transformer's hidden states (B, D)
         :param drawn: noise (B, N), standard normal
-        :param decode: from noise to actions (B, H A) in [-1, 1]
-        :return: (B, H A) in [-1, 1]
+        :param decode: function from noise (B, N) to actions (B, H A) in [-1, 1]
+        :return: actions (B, H A) in [-1, 1]
         """
         observation = actor_observation(normalization, newest, hidden if self.hidden_state else None)
         if not self.residual:
@@ -137,14 +138,14 @@ def make_online_actor(
     observation_dim: int, embed_dim: int, noise_dim: int, action_dim: int, settings: dict[str, Any]
 ) -> OnlineActor:
     """
-    :param observation_dim: O, of the environment
-    :param embed_dim: D, of the Transformer
-    :param noise_dim: N, of the head
-    :param action_dim: A
-    :param settings: the keyword arguments of :class:`OnlineActor`
-    :return: one whose weights are for the caller to load; PyTorch's global generator, which an algorithm may be learning by,
-        is left as it is
-    :raises ValueError: others than those, or one out of range
+    :param observation_dim: size of the policy's observation, with the features of images
+    :param embed_dim: width D of the Transformer
+    :param noise_dim: number N of the head's noise values
+    :param action_dim: size A of an action
+    :param settings: keyword arguments of :class:`OnlineActor`
+    :return: actor whose weights are for the caller to load; PyTorch's global generator, which an algorithm may be learning
+        by, is left as it is
+    :raises ValueError: a setting that is unknown, missing or out of range
     """
     try:
         sees = observation_dim + 2 + (embed_dim if settings.get("hidden_state") else 0)
@@ -158,7 +159,7 @@ def make_online_actor(
 
 def check_noise_actions(policy: SequencePolicy) -> int:
     """
-    :return: N, numbers of the noise that an online algorithm chooses
+    :return: number N of the noise values that an online algorithm chooses
     :raises ValueError: there is no flow
     """
     head = policy.network.head
@@ -170,8 +171,8 @@ def check_noise_actions(policy: SequencePolicy) -> int:
 
 def check_residual_actions(policy: SequencePolicy, n_action_steps: int) -> None:
     """
-    :param policy: to which actions are added
-    :param n_action_steps: of each plan
+    :param policy: policy that residual actions are added to
+    :param n_action_steps: number of executed actions of each plan
     :raises ValueError: there is no flow, or it executes several actions of a chunk
     """
     check_noise_actions(policy)

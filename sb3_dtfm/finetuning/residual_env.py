@@ -23,14 +23,14 @@ class ResidualActionVecEnv(FrozenPolicyVecEnv):
     Acts with a frozen DTFM, and adds an online algorithm's choice to its actions: residual reinforcement learning (Johannink
     et al., 2019; Silver et al., 2018). A choice of zeros is what the DTFM does with `deterministic=True`.
 
-    For observations, see :class:`~sb3_dtfm.finetuning.frozen_env.FrozenPolicyVecEnv`, and behind it the DTFM's own action,
-    between -1 and 1. Rewards are divided by `reward_unit`, what ten steps bring of the episode with the largest absolute
-    return of the model's training data, so that value functions need no other normalisation.
+    Observations are those of :class:`~sb3_dtfm.finetuning.frozen_env.FrozenPolicyVecEnv`, followed by the DTFM's own action,
+    between -1 and 1. Rewards are divided by `reward_unit`: ten times the largest absolute return-to-go of the model's
+    training data, per step of their longest episode. So value functions need no other normalisation.
 
     :param venv: environments wrapped in :class:`~sb3_dtfm.envs.ReturnToGoWrapper`
     :param model: a DTFM that carries out single actions without a critic's choice, or the path to a saved one
     :param bound: largest residual action, in units of actions in [-1, 1]
-    :param hidden_state: show the Transformer's hidden state as well
+    :param hidden_state: whether observations hold the Transformer's hidden state, too
     :raises ValueError: a policy that is no flow, carries out several actions of a plan or has its critic choose,
         environments that do not fit it, or an argument out of range
     """

@@ -1,7 +1,7 @@
 """
-Action heads: from the Transformer's hidden state to actions. One file a head.
+Action heads: maps from the Transformer's hidden state to actions.
 
-Each file says all of its head: options, noise, loss, actions, ways of acting, search space.
+Each file holds all of one head: options, noise, loss, actions, ways of acting, search space.
 """
 
 from sb3_dtfm.heads.base import ActionHead

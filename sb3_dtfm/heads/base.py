@@ -18,14 +18,14 @@ class ActionHead(nn.Module, ABC):
 
     :param embed_dim: width D of the hidden states
     :param action_dim: A
-    :param options: of `options_class`, by name: users give them among `policy_kwargs`
+    :param options: options of `options_class` by name, which users give among `policy_kwargs`
     :raises ValueError: an option out of range, by name
 
     :cvar algorithm: name of the algorithm that Transformer and head make together, for example "DTFM"
     :cvar discrete: the head for Discrete action spaces, with this head's options; None refuses them
     :cvar options_class: the head's options
-    :ivar options: how the head was made and acts; :meth:`Options.changed` gives other ways of acting
-    :ivar noise_dim: numbers of standard normal noise that an action starts from, 0 if none
+    :ivar options: options that the head was made with and acts by; :meth:`Options.changed` gives other ways of acting
+    :ivar noise_dim: number of standard normal values that an action starts from, 0 if none
     """
 
     algorithm: ClassVar[str]
@@ -47,8 +47,8 @@ class ActionHead(nn.Module, ABC):
         """
         Noise table of deterministic acting, saved with the weights: rows that it takes one after the other.
 
-        :param generator: for what is drawn
-        :return: (R, noise_dim)
+        :param generator: random number generator of the table
+        :return: table (R, noise_dim)
         """
         return th.randn(NOISE_ROWS, self.noise_dim, generator=generator, device=generator.device)
 
@@ -56,8 +56,8 @@ class ActionHead(nn.Module, ABC):
         """
         Random numbers of the loss, drawn apart from it, so that the loss is a plain function.
 
-        :param actions: (B, K, A), of the batch
-        :param generator: on the device of `actions`
+        :param actions: actions (B, K, A) of the batch
+        :param generator: random number generator on the device of `actions`
         :return: further arguments of :meth:`loss`, each (B, ...)
         """
         return ()
@@ -70,7 +70,7 @@ class ActionHead(nn.Module, ABC):
         :param hidden: (B, K, D)
         :param actions: (B, K, A) in [-1, 1]
         :param mask: (B, K) bool, False on padded steps
-        :param noise: noise of :meth:`draw_noise`
+        :param noise: noise that :meth:`draw_noise` drew
         :return: the loss to minimise, a mean over valid steps, and its parts by their logged names
         """
 
@@ -78,8 +78,8 @@ class ActionHead(nn.Module, ABC):
         """
         Parts of the loss that are means over some of the valid steps only; each is a plain summand of the loss.
 
-        :param mask: (B, K) bool, of a batch
-        :return: the steps of such a part (B, ...) bool, by its logged name
+        :param mask: mask (B, K) bool of a batch
+        :return: mask (B, ...) bool of the steps of each such part, by its logged name
         """
         return {}
 
@@ -100,7 +100,7 @@ class ActionHead(nn.Module, ABC):
         """
         Options that a hyperparameter search draws.
 
-        :param trial: Optuna's; numbers that are powers of two are drawn by their exponent, named `<option>_pow`
+        :param trial: Optuna's trial; numbers that are powers of two are drawn by their exponent, named `<option>_pow`
         """
         return {}
 

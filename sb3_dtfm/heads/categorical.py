@@ -8,7 +8,7 @@ from sb3_dtfm.networks.layers import Linear
 
 class CategoricalHead(ActionHead):
     """
-    A linear map of the hidden state to the logits of n choices, by cross-entropy.
+    A linear map of the hidden state to the logits of n choices, trained by cross-entropy.
 
     An action is n numbers, 1 for the choice and -1 for the others. The choice is the one whose logit and Gumbel noise have
     the largest sum: a draw from the softmax of the logits, and the most likely choice where the noise is zero.
@@ -36,7 +36,7 @@ class CategoricalHead(ActionHead):
     def forward(self, hidden: th.Tensor, noise: th.Tensor) -> th.Tensor:
         scores = self.linear(hidden) + gumbel(noise)
         chosen = scores.argmax(dim=-1, keepdim=True) == th.arange(scores.shape[-1], device=scores.device)
-        return th.where(scores.isnan().any(dim=-1, keepdim=True), th.nan, 2.0 * chosen - 1.0)  # of which argmax says nothing
+        return th.where(scores.isnan().any(dim=-1, keepdim=True), th.nan, 2.0 * chosen - 1.0)  # argmax would hide it
 
 
 def gumbel(noise: th.Tensor) -> th.Tensor:

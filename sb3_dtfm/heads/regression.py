@@ -8,7 +8,7 @@ from sb3_dtfm.networks.layers import Linear
 
 
 class RegressionHead(ActionHead):
-    """Decision Transformer (Chen et al., 2021): a linear map of the hidden state, bounded by tanh, by mean squared error."""
+    """Decision Transformer (Chen et al., 2021): a linear map of the hidden state, bounded by tanh, trained by MSE."""
 
     algorithm = "DT"
     discrete = CategoricalHead

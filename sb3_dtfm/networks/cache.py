@@ -1,5 +1,5 @@
 """
-Acting on the keys and values kept of earlier steps: one step's tokens instead of a whole window's.
+Acting on the cached keys and values of earlier steps: it takes one step's tokens instead of a whole window's.
 
 Keys and values, copied at every step instead of appended to, make an action for 16 environments at the paper's size take
 21 % longer (19 MB).
@@ -33,8 +33,8 @@ def extend(
     than this window once it slides. Equal to `forward` for the first K steps of an episode, and to attention with a band of
     K steps over the whole episode from then on.
 
-    :param trunk: its weights
-    :param observations: (B, K, O), and the others as for `forward`; the last two steps are read
+    :param trunk: Transformer whose weights are used
+    :param observations: (B, K, O); this and the others as for `forward`, of which the last two steps are read
     :param keys_values: (B, layers, 2, L, D) for the L tokens of K steps (:meth:`SequenceTrunk.n_tokens`), any finite number
         where `mask` is False; those of the last `tokens_per_step` tokens are filled in, see :func:`fill_in`
     :return: (B, D) hidden state, and the keys and values of each layer, (B, 2, L, D)
@@ -57,7 +57,7 @@ def extend_cache(trunk: SequenceTrunk, windows: dict[str, th.Tensor], cache: np.
     """
     The newest hidden states from what was kept, and what to keep for the next step.
 
-    :param trunk: its weights
+    :param trunk: Transformer whose weights are used
     :param windows: (B, K, ...), normalised, by the names of `SequenceTrunk.forward`
     :param cache: (B, layers, 2, L, D) for the L tokens before the newest, or (B, 0) if the last steps were acted without
     :return: (B, D) hidden states, and the new cache
@@ -101,8 +101,8 @@ class KeyValueCache(np.ndarray):
     """
     Keys and values of earlier steps, (B, layers, 2, L, D), which never change, and the memory behind them.
 
-    :ivar behind: that memory, shaped like this but longer, and where these end in it: for the first who takes it, from
-        whatever thread. Copies have none, nor has what NumPy computes.
+    :ivar behind: that memory, shaped like this but longer, and the position where these end in it: for the first who takes
+        it, from whatever thread. Copies have none, nor have NumPy's results.
     """
 
     behind: list[tuple[th.Tensor, int]]
@@ -111,8 +111,8 @@ class KeyValueCache(np.ndarray):
 def make_cache(memory: th.Tensor, start: int, end: int) -> KeyValueCache:
     """
     :param memory: (B, layers, 2, M, D), on any device
-    :param start: of what is kept, along the fourth axis
-    :param end: of what is kept
+    :param start: first token to keep, along the fourth axis
+    :param end: end of the tokens to keep, exclusive
     """
     kept = memory[..., start:end, :].cpu().numpy().view(KeyValueCache)
     kept.behind = [(memory, end)]
@@ -121,10 +121,10 @@ def make_cache(memory: th.Tensor, start: int, end: int) -> KeyValueCache:
 
 def reserve_cache(kept: np.ndarray, n_tokens: int, device: th.device) -> tuple[th.Tensor, int]:
     """
-    :param kept: what :func:`make_cache` gave, a copy of it, or another array like it
-    :param n_tokens: how many will be appended
-    :param device: where they will
-    :return: memory with room for them that is nobody else's, and where `kept` ends in it
+    :param kept: cache that :func:`make_cache` returned, a copy of it, or another array like it
+    :param n_tokens: number of tokens that will be appended
+    :param device: device of the tokens that will be appended
+    :return: memory with room for them that is nobody else's, and the position where `kept` ends in it
     """
     with contextlib.suppress(IndexError):
         memory, end = getattr(kept, "behind", []).pop()

@@ -31,9 +31,9 @@ RETURN_CLIP = 10.0
 
 class Linear(nn.Linear):
     """
-    torch's linear layer; few rows times a large weight on a CPU, without gradients, by NumPy.
+    torch's linear layer; on a CPU, without gradients, NumPy computes the product of few rows and a large weight.
 
-    By `einsum`, which reads weights as fast on one thread as `dot` does on two; of these the second may have to be waited
+    It takes `einsum`, which reads weights as fast on one thread as `dot` does on two: the second one may have to be waited
     for, and 50 solver steps took from 28 to 130 ms.
     """
 
@@ -62,7 +62,7 @@ def normal_(weight: th.Tensor, std: float) -> None:
     """
     Draw a weight from a normal distribution around 0, unless it is a shape without numbers: torch takes a second for that.
 
-    :param weight: any shape; on the device "meta" it stays as it is
+    :param weight: tensor of any shape; on the device "meta" it stays as it is
     :param std: standard deviation
     """
     if not weight.is_meta:
@@ -70,7 +70,7 @@ def normal_(weight: th.Tensor, std: float) -> None:
 
 
 def embedding(n_entries: int, dim: int) -> nn.Embedding:
-    """torch's with its own start, which on the device "meta" would import its compiler for a second."""
+    """torch's embedding and initial weights; torch's own way would import its compiler on "meta", which takes a second."""
     weight = th.empty(n_entries, dim)
     normal_(weight, std=1.0)
     return nn.Embedding.from_pretrained(weight, freeze=False)
@@ -84,8 +84,8 @@ def keep_mask(like: th.Tensor, probability: float) -> th.Tensor:
     NumPy's SFC64, itself seeded by torch's global generator, take an eighth of the time.
 
     :param like: tensor on the CPU
-    :param probability: of a zero, in [0, 1)
-    :return: shape and dtype of `like`
+    :param probability: probability of a zero, in [0, 1)
+    :return: factors with the shape and dtype of `like`
     """
     seed = int(th.randint(np.iinfo(np.int64).max, ()))
     raw = np.random.SFC64(seed).random_raw(-(-like.numel() // 4))
@@ -98,9 +98,9 @@ def keep_mask(like: th.Tensor, probability: float) -> th.Tensor:
 
 def dropout(x: th.Tensor, probability: float, training: bool) -> th.Tensor:
     """
-    :param x: any shape
-    :param probability: of a zero
-    :param training: leave x alone if not
+    :param x: tensor of any shape
+    :param probability: probability of a zero, in [0, 1)
+    :param training: whether dropout applies; otherwise x stays as it is
     """
     if not training or probability == 0.0:
         return x
@@ -115,7 +115,7 @@ def dropout_add(residual: th.Tensor, x: th.Tensor, probability: float, training:
 
 
 def _draws_masks_here(x: th.Tensor) -> bool:
-    """A compiled graph draws its own, fused with what uses them."""
+    """Return whether masks are drawn by NumPy; a compiled graph draws its own, fused with what uses them."""
     return x.device.type == "cpu" and not th.compiler.is_compiling()
 
 
@@ -125,9 +125,9 @@ def sinusoidal_embedding(
     """
     Sines and cosines at geometrically spaced frequencies.
 
-    :param tau: (...), about [0, 1]
-    :param embedding_dim: even
-    :param frequencies: the lowest and the highest, rad
+    :param tau: numbers (...), such as times in [0, 1] or scaled returns-to-go
+    :param embedding_dim: number of sines and cosines, even
+    :param frequencies: lowest and highest frequency, rad
     :return: (..., embedding_dim)
     """
     low, high = map(math.log, frequencies)

@@ -11,7 +11,7 @@ from torch.optim.adamw import adamw
 
 # State of AdamW for each parameter, by torch's names.
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")
-# Bytes, of torch's own memory on a CPU.
+# Bytes of which addresses are multiples in torch's own memory on a CPU.
 ALIGNMENT = 64
 
 
@@ -23,8 +23,8 @@ class FlatTensors:
     last digit. The numbers between them are zero. Whoever replaces their memory, as moving a network to another device does,
     has them laid out again at the next use.
 
-    :param tensors: of the same dtype, in the order in which they are laid out
-    :ivar sizes: numbers that each takes with the zeros behind it
+    :param tensors: tensors of the same dtype, in the order in which they are laid out
+    :ivar sizes: number of elements that each takes with the zeros behind it
     """
 
     def __init__(self, tensors: Iterable[th.Tensor]) -> None:
@@ -51,7 +51,7 @@ class FlatTensors:
 
 
 def slot_size(tensor: th.Tensor) -> int:
-    """The next multiple of 64 bytes, in numbers of the tensor's."""
+    """Number of a tensor's elements, rounded up to a multiple of 64 bytes."""
     numbers = ALIGNMENT // tensor.element_size()
     return -(-tensor.numel() // numbers) * numbers
 
@@ -63,13 +63,13 @@ class FlatAdamW(th.optim.AdamW):
     A state dict has the layout of torch's AdamW.
 
     :param decayed: parameters with weight decay
-    :param spared: parameters without
-    :param unclipped: those of both whose gradients :meth:`clip_gradient` leaves alone
+    :param spared: parameters without weight decay
+    :param unclipped: parameters of both kinds whose gradients :meth:`clip_gradient` leaves alone
     :param lr: learning rate
-    :param weight_decay: of `decayed`
+    :param weight_decay: weight decay of `decayed`
     """
 
-    # torch's own but for a mark for its compiler, which loads the compiler: a second and a half of each start.
+    # torch's own methods without the mark for its compiler, which loads the compiler: a second and a half of each start.
     add_param_group = inspect.unwrap(th.optim.Optimizer.add_param_group)
     state_dict = inspect.unwrap(th.optim.Optimizer.state_dict)
     load_state_dict = inspect.unwrap(th.optim.Optimizer.load_state_dict)
@@ -119,8 +119,8 @@ class FlatAdamW(th.optim.AdamW):
         """
         Scale the gradients down to a norm, as `torch.nn.utils.clip_grad_norm_` does, and keep them for :meth:`step`.
 
-        :param max_norm: of all that are not left alone
-        :return: the norm that they had
+        :param max_norm: largest norm of the gradients of all parameters that are not left alone
+        :return: norm that they had
         """
         gradient = self._flat_gradient()
         if gradient is None:

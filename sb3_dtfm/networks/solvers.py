@@ -45,7 +45,7 @@ def integrate(field: Field, noise: th.Tensor, flow_solver: str = "euler", flow_s
     The global error falls with the step to the power 1 (euler), 2 (midpoint, heun) or 4 (rk4), at 1, 2, 2 and 4 field
     evaluations a step, all at times that :func:`solver_times` lists.
 
-    :param field: velocity of (x, tau), shaped like x
+    :param field: function from (x, tau) to the velocity, shaped like x
     :param noise: (..., A), x at tau = 0
     :param flow_solver: a key of `SOLVERS`
     :param flow_steps: number of steps, at least 1

@@ -51,14 +51,14 @@ class TransformerBlock(nn.Module):
         return attention(query, key, value, attention_bias, dropout_p).transpose(1, 2).flatten(start_dim=2)
 
     def _drop_heads(self, value: th.Tensor) -> th.Tensor:
-        """Dropout of attention weights that are all 1: of a single token's values, (B, 1, D), whole heads."""
+        """Drop whole heads of a single token's values, (B, 1, D): dropout of attention weights that are all 1."""
         if not self.training or self.dropout == 0.0:
             return value
         weights = dropout(value.new_ones(len(value), 1, self.n_heads, 1), self.dropout, self.training)
         return (weights * value.unflatten(-1, (self.n_heads, -1))).flatten(start_dim=2)
 
     def finish(self, tokens: th.Tensor, attended: th.Tensor) -> th.Tensor:
-        """The residual paths of tokens and of what they attended to, (B, Q, D) each; then the MLP."""
+        """Add tokens and what they attended to, (B, Q, D) each, on a residual path; then the MLP on another."""
         tokens = dropout_add(tokens, self.attention_out(attended), self.dropout, self.training)
         mapped = self.mlp_out(F.gelu(self.mlp_in(self.mlp_norm(tokens))))
         return dropout_add(tokens, mapped, self.dropout, self.training)
@@ -103,11 +103,11 @@ class SequenceTrunk(nn.Module):
     :param max_timestep: number of embedded time steps; later ones share the last embedding
     :param embed_dim: width D
     :param n_layers: number of blocks
-    :param n_heads: attention heads, a divisor of `embed_dim`
-    :param dropout: probability on embeddings, attention weights and residual branches
-    :param timestep_embedding: add the embeddings of time steps
-    :param tokens_per_step: 3 or 1
-    :param film_return_to_go: scale and shift the tokens before each block by the return-to-go of their step, so that
+    :param n_heads: number of attention heads, a divisor of `embed_dim`
+    :param dropout: dropout probability of embeddings, attention weights and residual branches
+    :param timestep_embedding: whether the embeddings of time steps are added
+    :param tokens_per_step: number of tokens of a step, 3 or 1
+    :param film_return_to_go: whether the return-to-go of their step scales and shifts the tokens before each block, so that
         observations do not outweigh the target return
     """
 
@@ -140,7 +140,7 @@ class SequenceTrunk(nn.Module):
         self.blocks = nn.ModuleList(TransformerBlock(embed_dim, n_heads, dropout) for _ in range(n_layers))
         self.final_norm = nn.LayerNorm(embed_dim)
         self.apply(self._initialize)
-        self.film = ReturnFilm(embed_dim, n_layers) if film_return_to_go else None  # which starts in its own way
+        self.film = ReturnFilm(embed_dim, n_layers) if film_return_to_go else None  # it has its own initial weights
 
     def _initialize(self, module: nn.Module) -> None:
         """GPT-2's initialisation: normal weights of 0.02, and smaller where residual branches add up."""
@@ -167,7 +167,7 @@ class SequenceTrunk(nn.Module):
         :param returns_to_go: (B, K), scaled
         :param timesteps: (B, K) int64
         :param mask: (B, K) bool, False on padded steps
-        :param last_only: compute the newest step's hidden state alone
+        :param last_only: whether the newest step's hidden state alone is computed
         :return: (B, K, D) hidden states, (B, 1, D) with `last_only`
         """
         tokens = self.embed(observations, actions, returns_to_go, timesteps, mask)

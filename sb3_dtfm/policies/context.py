@@ -50,7 +50,7 @@ class Context(NamedTuple):
 
     @property
     def windows(self) -> Windows:
-        """The steps alone."""
+        """The windows alone."""
         return Windows(*(getattr(self, name) for name in Windows._fields))
 
 
@@ -71,11 +71,11 @@ def empty_context(n_rows: int, context_length: int, observation_dim: int, action
 
 def check_context(state: Any, nothing: Context) -> Context:
     """
-    The context that a caller passes back. Its plan, and what the policy keeps, may be of another way of acting.
+    The context that a caller passes back. Its plan, keys and values may come from another way of acting.
 
-    :param state: what an earlier call returned
+    :param state: state that an earlier call returned
     :param nothing: an empty context of the caller's environments
-    :raises ValueError: something else, or of other environments
+    :raises ValueError: no such state, or one of other environments
     """
     if not isinstance(state, tuple | list) or len(state) != len(nothing):
         found = f"a {type(state).__name__}" + (f" of {len(state)}" if isinstance(state, tuple | list) else "")
@@ -93,7 +93,7 @@ def check_context(state: Any, nothing: Context) -> Context:
 def check_episode_start(episode_start: Any, n_rows: int) -> np.ndarray:
     """
     :return: (B,) bool, or (1,) for all rows alike
-    :raises ValueError: not one for each row, nor one for all
+    :raises ValueError: neither one value for each row nor one for all
     """
     starts = np.asarray(episode_start, dtype=bool).reshape(-1)
     if len(starts) not in (1, n_rows):
@@ -106,7 +106,7 @@ def restarts(context: Context, timestep: np.ndarray, episode_start: np.ndarray |
     Return where a new step begins a context of its own: at the start of an episode, and where it follows nothing.
 
     :param timestep: (B,) int64
-    :param episode_start: (B,) bool, True where the caller says so
+    :param episode_start: (B,) bool, True where the caller starts an episode
     :return: (B,) bool
     """
     follows = context.mask[:, -1] & (timestep == context.timesteps[:, -1] + 1)
@@ -128,7 +128,7 @@ def push(
     :param return_to_go: (B,)
     :param timestep: (B,) int64
     :param episode_start: (B,) bool
-    :param frames: (B, ...) each, what tells episodes apart at their start; the observation alone if not given
+    :param frames: arrays (B, ...) that tell episodes apart at their start; the observation alone if not given
     """
     restart = restarts(context, timestep, episode_start)
     starting = np.flatnonzero(restart)
@@ -271,7 +271,7 @@ def _array(observation: dict[str, Any], key: str) -> np.ndarray:
 
 
 def _convert(array: np.ndarray, dtype: type) -> np.ndarray:
-    """The numbers in another type; those that it has not become infinite, or negative where they should be whole."""
+    """Convert numbers to a type; those that it cannot hold become infinite, or -1 where they should be whole."""
     if array.dtype == dtype:
         return array
     with np.errstate(over="ignore", invalid="ignore"):

@@ -13,7 +13,7 @@ from torch import nn
 
 from sb3_dtfm.transitions import Transitions
 
-# Kostrikov et al. (2022): how fast the network that backups look at follows, and the rate at which all learn.
+# Kostrikov et al. (2022): share by which the target network follows at each gradient step, and the learning rate of all.
 TARGET_SHARE = 0.005
 LEARNING_RATE = 3e-4
 # Value of the largest discounted return-to-go after scaling.
@@ -33,9 +33,10 @@ class Critic(nn.Module):
     the reward and the discounted V of the next observation. The smaller of two Qs counts.
 
     :param observation_dim: O
-    :param action_dim: h A, of all actions that are valued together
-    :param hidden_dim: width of two hidden layers
-    :param expectile: in (0.5, 1): 0.5 values the data's policy, near 1 the best of its actions, and noise with them
+    :param action_dim: size h A of the h actions that are valued together
+    :param hidden_dim: width of the two hidden layers
+    :param expectile: expectile of the value loss, in [0.5, 1): 0.5 values the data's policy, near 1 the best of its
+        actions, and noise with them
     """
 
     batch_size = 256
@@ -62,7 +63,7 @@ class Critic(nn.Module):
 
     def forward(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
-        The smaller of the two values of the network that follows.
+        The smaller of the target network's two values.
 
         :param observations: (..., O), normalised
         :param actions: (..., h A) in [-1, 1]
@@ -86,8 +87,8 @@ class Critic(nn.Module):
 
     def loss(self, batch: Transitions) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """
-        :param batch: observations normalised, actions in [-1, 1]
-        :return: the loss to minimise, and what is logged
+        :param batch: transitions with normalised observations, and actions in [-1, 1]
+        :return: the loss to minimise, and values to log by name
         """
         pairs = th.cat((batch.observations, batch.actions), dim=-1)
         with th.no_grad():
@@ -109,10 +110,10 @@ class Critic(nn.Module):
 
     def learn(self, batch: Transitions) -> dict[str, th.Tensor]:
         """
-        A gradient step. One whose loss is not finite leaves networks that learn, and the spread, as they are.
+        Take a gradient step. A loss that is not finite leaves the trained networks and `advantage_std` as they are.
 
-        :param batch: observations normalised, actions in [-1, 1]
-        :return: what is logged
+        :param batch: transitions with normalised observations, and actions in [-1, 1]
+        :return: values to log by name
         """
         loss, parts = self.loss(batch)
         self.optimizer.zero_grad(set_to_none=True)
@@ -140,12 +141,12 @@ class Critic(nn.Module):
         Several draws from the head, and which of them the critic takes.
 
         :param observations: (b, O), normalised
-        :param rows: (b,) of the noise table; the first sample's are these, and what it would be without others
-        :param draw: from rows (M,) to noise (M, noise_dim)
-        :param decode: from noise (b, N, noise_dim) to actions (b, N, H A) in [-1, 1]
-        :param n_samples: N
+        :param rows: rows (b,) of the noise table, which the first sample starts from, as it would without others
+        :param draw: function from rows (M,) to noise (M, noise_dim)
+        :param decode: function from noise (b, N, noise_dim) to actions (b, N, H A) in [-1, 1]
+        :param n_samples: number N of samples
         :param noise_std: standard deviation of the noise of all samples but the first
-        :param temperature: see :meth:`choose`
+        :param temperature: temperature of the choice, see :meth:`choose`
         :return: actions (b, N, H A), and the index (b,) int64 of the one that is taken
         """
         shape, turns = (len(rows), n_samples), np.arange(n_samples)
@@ -159,13 +160,13 @@ class Critic(nn.Module):
 
     def choose(self, gains: th.Tensor, temperature: float, uniform: th.Tensor) -> th.Tensor:
         """
-        One of N actions, with probabilities softmax(gain / (temperature * advantage_std)); with Q in its place in
-        Hansen-Estruch et al. (2023).
+        Choose one of N actions, with probabilities softmax(gain / (temperature * advantage_std)). Hansen-Estruch et al.
+        (2023) have Q in place of the gain.
 
-        :param gains: (B, N), of :meth:`gains`
-        :param temperature: 0 takes the largest
-        :param uniform: (B, N) in (0, 1), what chance decides by (Gumbel's trick)
-        :return: (B,) int64
+        :param gains: (B, N), as from :meth:`gains`
+        :param temperature: temperature in units of `advantage_std`; 0 takes the largest gain
+        :param uniform: uniform random numbers (B, N) in (0, 1), for the Gumbel-max trick
+        :return: indices (B,) int64 of the actions
         """
         chance = -(-uniform.log()).log()
         return (gains + temperature * self.advantage_std * chance).argmax(dim=-1)

@@ -1,4 +1,4 @@
-"""A policy as one function of tensors, which a graph can hold: what lies between a context and the actions in `predict`."""
+"""A policy as one function of tensors, which a graph can hold: the computation of `predict` from a context to actions."""
 
 import copy
 from typing import Any
@@ -17,15 +17,15 @@ from sb3_dtfm.windows import Windows
 
 class ExportedPolicy(nn.Module):
     """
-    The policy as it acts at present: from windows to actions, both in the environment's units, for any number of rows.
+    The policy as it acts at present: a map from windows to actions, both in the environment's units, for any number of rows.
 
-    Whoever calls it keeps the windows: shifts them by a step, puts in the newest one, and when the action is carried out
-    that, too. A row begins anew when its mask is cleared; what is behind the mask may be any finite number.
+    The caller keeps the windows: it shifts them by a step, fills in the newest one and, when an action is carried out,
+    that action. A row begins anew when its mask is cleared; what is behind the mask may be any finite number.
 
     Actions of a Discrete space are vectors here: 1 for the choice, 0 for the others. The newest images are inputs;
     features of earlier images are state in and state out.
 
-    :param policy: stays as it is; what acts of it is copied to the CPU
+    :param policy: policy to export, which stays as it is; the parts that act are copied to the CPU
     :raises ValueError: its critic would choose among several draws
     """
 
@@ -74,17 +74,17 @@ class ExportedPolicy(nn.Module):
     ) -> tuple[th.Tensor, ...]:
         """
         :param observations: (B, K, O), newest step last, as the environment gives them
-        :param actions: (B, K, A) that were carried out, in the environment's range; the last one is not read
+        :param actions: executed actions (B, K, A) in the environment's range; the last one is not read
         :param returns_to_go: (B, K), environment reward units
         :param timesteps: (B, K) int64, counted from the episode's start
         :param mask: (B, K) bool, False on padded steps
-        :param noise: (B, N), standard normal; a row of zeros takes what `predict(deterministic=True)` takes. For a head
-            that starts from noise
+        :param noise: (B, N), standard normal; a row of zeros is replaced by the noise of `predict(deterministic=True)`.
+            For a head that starts from noise
         :param episode_keys: (B,) int64, CRC-32 of the bytes of each episode's first observation, float32, and behind it
             those of its images; with `noise`
-        :param keys_values: (B, layers, 2, L, D), what the last call returned or any finite numbers; for `kv_cache`
-        :param features: (B, K, F), what the last call returned or any finite numbers; with images
-        :param images: of the newest step, (B, channels, height, width) uint8 by camera
+        :param keys_values: (B, layers, 2, L, D), as the last call returned them, or any finite numbers; for `kv_cache`
+        :param features: (B, K, F), as the last call returned them, or any finite numbers; with images
+        :param images: images of the newest step, (B, channels, height, width) uint8 by camera
         :return: chunk (B, H, A), the actions for this step and the next ones, in the action space; with `kv_cache` the
             next `keys_values`; with images the next `features`
         """
@@ -119,7 +119,7 @@ class ExportedPolicy(nn.Module):
         """
         Inputs of :meth:`forward` by name, those that this policy takes: full windows of random numbers.
 
-        :param n_rows: B
+        :param n_rows: number B of rows
         :raises ValueError: an image has the name of another input
         """
         shape, trunk, noise_dim = (n_rows, self.context_length), self.network.trunk, self.settings["noise_dim"]

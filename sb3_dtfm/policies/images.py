@@ -28,8 +28,9 @@ class ResidualExtractor(BaseFeaturesExtractor):
     run each).
 
     :param observation_space: Box (channels, height, width)
-    :param features_dim: numbers that an image becomes
-    :param channels: of the first convolution and of each residual block; all but the last block halve height and width
+    :param features_dim: number of features of an image
+    :param channels: channels of the first convolution and of each residual block; all but the last block halve height
+        and width
     :param crop: kept share of height and width, in (0, 1]
     :param shift: pixels by which the edges are repeated before a random crop; 4 with `crop=1.0` is the random shift of DrQ
         (Kostrikov et al., 2021)
@@ -92,9 +93,9 @@ class ResidualBlock(nn.Module):
     """
     Two convolutions beside a shortcut (He et al., 2016), with group normalisation (Wu and He, 2018).
 
-    :param n_in: channels that come in
-    :param n_out: channels that go out
-    :param stride: of the first convolution
+    :param n_in: number of input channels
+    :param n_out: number of output channels
+    :param stride: stride of the first convolution, and of the shortcut
     """
 
     def __init__(self, n_in: int, n_out: int, stride: int) -> None:
@@ -128,7 +129,7 @@ def spatial_softmax(maps: th.Tensor) -> th.Tensor:
     return th.cat(((weights.sum(dim=2) * rows).sum(dim=1), (weights.sum(dim=1) * columns).sum(dim=1)), dim=1)
 
 
-# By the name that `features_extractor_class` and saved models have; a user's own class is entered here before loading.
+# Extractors by their name in `features_extractor_class` and saved models; a user's own is entered here before loading.
 EXTRACTORS: dict[str, type[BaseFeaturesExtractor]] = {
     each.__name__: each for each in (ResidualExtractor, NatureCNN, ResNet18)
 }
@@ -164,10 +165,10 @@ class ImageEncoder(nn.Module):
 
     :param image_spaces: Box (channels, height, width) uint8 by camera
     :param extractor: a key of `EXTRACTORS`
-    :param extractor_kwargs: of that class
-    :param normalize_images: divide by 255, as SB3 does; otherwise the extractors get numbers from 0 to 255
-    :param shared: one extractor for all cameras, whose images have the same shape
-    :ivar features_dim: F
+    :param extractor_kwargs: arguments of that class, by name
+    :param normalize_images: whether images are divided by 255, as in SB3; otherwise the extractors get numbers from 0 to 255
+    :param shared: whether one extractor serves all cameras, whose images then have the same shape
+    :ivar features_dim: number F of features of all cameras
     :raises ValueError: an extractor that cannot take the images
     """
 
@@ -234,11 +235,11 @@ def unpack_images(observation: Mapping[str, Any], expected: Mapping[str, spaces.
     """
     The images of an observation, channels first.
 
-    :param observation: of a `ReturnToGoWrapper`, images (B, ...) or of one environment
+    :param observation: observation of a `ReturnToGoWrapper`, with images (B, ...), or one image for each camera
     :param expected: Box (channels, height, width) by camera
-    :param n_rows: B
+    :param n_rows: number B of rows
     :return: (B, channels, height, width) uint8 by camera
-    :raises ValueError: a camera is missing, or its image is another one than the model's
+    :raises ValueError: a missing camera, or an image of another type or shape than the model's
     """
     images = {}
     for camera, space in expected.items():

@@ -30,7 +30,7 @@ class RememberedContext:
 
         :param observation: (B, O)
         :param timestep: (B,)
-        :return: None where nothing of B environments is remembered
+        :return: that context; None where nothing of B environments is remembered
         """
         before, after = self._before, self._after
         if before is None or after is None or len(after.mask) != len(observation):
@@ -42,9 +42,9 @@ class RememberedContext:
 
     def remember(self, before: Context, after: Context) -> Context:
         """
-        :param before: what :meth:`recall` gave, or an empty context
-        :param after: with the newest step and its action
-        :return: it for the caller, who cannot write into what is remembered
+        :param before: context that :meth:`recall` returned, or an empty one
+        :param after: context with the newest step and its action
+        :return: `after` as read-only arrays for the caller, so that what is remembered stays
         """
         self._before, self._after = before, after
         shown = Context(*(array.view() for array in after))

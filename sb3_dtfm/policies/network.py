@@ -11,7 +11,7 @@ from sb3_dtfm.networks.trunk import SequenceTrunk
 from sb3_dtfm.policies.images import ImageEncoder
 from sb3_dtfm.windows import OBSERVATION, Windows
 
-# An image's, of 84 x 84 by the default extractor: convolutions keep all threads busy.
+# Multiply-accumulates of an image of 84 x 84 in the default extractor: convolutions keep all threads busy.
 N_MACS_OF_IMAGES = 15_000_000
 HIDDEN_DIM = 256
 # The lower and the upper expectile: 0.5 would be the mean twice, 0 and 1 the extremes.
@@ -60,11 +60,11 @@ class SequenceNetwork(nn.Module):
     """
     A map from normalised windows to the loss, or to actions in [-1, 1].
 
-    :param trunk: from windows to hidden states
-    :param head: from hidden states to actions
-    :param return_range: what the return-to-go is kept within while acting; None leaves it alone
-    :param encoder: from images to features; None where there are no images
-    :ivar n_macs: multiplications of a step of a window on the way forward, without attention's
+    :param trunk: Transformer from windows to hidden states
+    :param head: head from hidden states to actions
+    :param return_range: range that the return-to-go is clamped to while acting; None leaves it alone
+    :param encoder: encoder from images to features; None where there are no images
+    :ivar n_macs: multiply-accumulates of a window's step in the forward pass, without attention's
     """
 
     def __init__(
@@ -95,16 +95,16 @@ class SequenceNetwork(nn.Module):
 
     def draw_noise(self, batch: Windows, generator: th.Generator) -> tuple[th.Tensor, ...]:
         """
-        :param batch: as for :meth:`loss`
-        :param generator: on the device of the batch
+        :param batch: batch, as for :meth:`loss`
+        :param generator: random number generator on the device of the batch
         :return: further arguments of :meth:`loss`, see :meth:`ActionHead.draw_noise`
         """
         return self.head.draw_noise(chunks_of(batch), generator)
 
     def loss(self, batch: Windows, *noise: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """
-        :param batch: normalised, actions in [-1, 1], (B, K + H - 1, A) of them
-        :param noise: of :meth:`draw_noise` for the batch
+        :param batch: normalised windows, with actions (B, K + H - 1, A) in [-1, 1]
+        :param noise: noise that :meth:`draw_noise` drew for the batch
         :return: the loss to minimise, and its parts by their logged names
         """
         chunks = chunks_of(batch)
@@ -118,7 +118,7 @@ class SequenceNetwork(nn.Module):
         return loss, parts
 
     def within_range(self, windows: Windows) -> Windows:
-        """Windows (B, K, ...) whose returns-to-go recordings reached from such observations."""
+        """Windows (B, K, ...) with returns-to-go clamped to the range that was recorded from such observations."""
         if self.return_range is None:
             return windows
         return windows._replace(returns_to_go=self.return_range(windows.observations, windows.returns_to_go))
@@ -139,5 +139,5 @@ def chunks_of(batch: Windows) -> th.Tensor:
 
 
 def _n_weights(network: nn.Module) -> int:
-    """Numbers in its linear layers' weights."""
+    """Number of elements in the weights of a network's linear layers."""
     return sum(layer.weight.numel() for layer in network.modules() if isinstance(layer, nn.Linear))

@@ -29,13 +29,14 @@ class Normalization(nn.Module):
 
     :param observation_dim: O, or O + F with the features of images behind, which stay as they are
     :param action_space: bounded Box (A,)
-    :param max_timestep: T, the longest episode; time steps with a range of return-to-go of their own
-    :param clip_return_to_go: keep the return-to-go within what the data showed at the same time step
-    :param return_scaling: "timestep" subtracts the mean of the data's returns-to-go at the same time step and divides by
-        their standard deviation there: good and bad episodes are as far apart at the last step as at the first one. "max"
-        divides by the largest return-to-go of the data, as Decision Transformer does; None makes it zero
-    :param observation_scaling: "std" divides observations by their standard deviation over all steps; "robust" by the
-        lower quartile of the episodes' standard deviations
+    :param max_timestep: number T of steps of the longest episode; each time step has its own range of returns-to-go
+    :param clip_return_to_go: whether the return-to-go stays within the range recorded at the same time step
+    :param return_scaling: scaling of the return-to-go: "timestep" subtracts the mean of the data's returns-to-go at the same
+        time step and divides by their standard deviation there, so that good and bad episodes are as far apart at the last
+        step as at the first one; "max" divides by the largest return-to-go of the data, as Decision Transformer does; None
+        makes it zero
+    :param observation_scaling: scaling of observations: "std" divides by their standard deviation over all steps, "robust"
+        by the lower quartile of the episodes' standard deviations
     """
 
     observation_mean: th.Tensor
@@ -116,7 +117,7 @@ class Normalization(nn.Module):
 
     def forward(self, windows: Windows) -> Windows:
         """
-        :param windows: tensors; observations and returns-to-go as the environment gives them
+        :param windows: windows of tensors; observations and returns-to-go as the environment gives them
         :return: observations normalised and clipped, returns-to-go scaled to about [-1, 1], the others as they are
         """
         return windows._replace(
@@ -142,7 +143,7 @@ class Normalization(nn.Module):
         return deviations.clamp(-RETURN_CLIP, RETURN_CLIP) / RETURN_UNIT
 
     def scale_observation(self, observations: th.Tensor) -> th.Tensor:
-        """Normalised and clipped, (..., O)."""
+        """Normalise and clip observations (..., O)."""
         scaled = (observations - self.observation_mean) / self.observation_std
         return scaled.clamp(-OBSERVATION_CLIP, OBSERVATION_CLIP) * self.observation_gain
 

@@ -7,7 +7,7 @@ from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-# Mean and standard deviation of ImageNet's channels, by which the weights that torchvision publishes expect them.
+# Mean and standard deviation of ImageNet's channels, by which torchvision's published weights expect them normalised.
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 CHANNELS_PER_GROUP = 16
 # Buffers of batch normalisation.
@@ -33,7 +33,7 @@ class ResNet18(BaseFeaturesExtractor):
     does not know, as in Diffusion Policy (Chi et al., 2023).
 
     :param observation_space: Box (3, height, width)
-    :param features_dim: numbers that an image becomes
+    :param features_dim: number of features of an image
     :param weights: file of torchvision's weights, as `torch.save(resnet18(...).state_dict(), weights)` writes it; not saved
         with a model, which holds the weights that it has learned. Random weights if not given
     :raises ImportError: torchvision is not installed, or was built for another torch

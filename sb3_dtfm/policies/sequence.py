@@ -1,4 +1,4 @@
-"""The policy: networks by its options, the optimiser they learn by, and acting with the context of the last steps."""
+"""The policy: networks made from its options, their optimiser, and acting with the context of the last steps."""
 
 import copy
 import json
@@ -54,10 +54,10 @@ class SequencePolicy(BasePolicy):
     :param action_space: bounded Box (A,); or Discrete, whose actions are vectors for all but `predict`, see
         :mod:`~sb3_dtfm.actions`
     :param lr_schedule: learning rate over the progress remaining, from 1 to 0
-    :param context_length: K, steps the policy sees
-    :param max_timestep: time steps with an embedding of their own
-    :param weight_decay: AdamW's, on weight matrices only
-    :param ema: keep an exponential moving average of the weights and act with it
+    :param context_length: number K of steps that the policy sees
+    :param max_timestep: number of time steps with an embedding of their own
+    :param weight_decay: AdamW's weight decay, of weight matrices only
+    :param ema: whether the policy keeps an exponential moving average of the weights, and acts with it
     :param seed: seed of the noise that acting starts from
     :param options: options of :class:`~sb3_dtfm.policies.options.PolicyOptions` and of the head
     :raises ValueError: an argument out of range or unknown, by name, or an action space that the head does not learn
@@ -203,11 +203,11 @@ class SequencePolicy(BasePolicy):
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """
-        torch's, for a policy with or without a moving average whatever was saved: one that begins starts from the weights.
+        Load a state as torch does. A moving average that was not saved starts from the weights; an unwanted one is dropped.
 
         :param state_dict: state of a policy like this one
-        :param strict: as in torch
-        :param assign: as in torch
+        :param strict: whether the names have to be those of this policy, as in torch
+        :param assign: whether tensors replace the policy's instead of being copied into them, as in torch
         """
         weights = {name: value for name, value in state_dict.items() if not name.startswith("ema_network.")}
         if self.ema_network is None:
@@ -260,7 +260,7 @@ class SequencePolicy(BasePolicy):
         Return how often the critic has another sample taken than the first one, at the newest steps of windows.
 
         :param batch: windows of a buffer
-        :param generator: decides which rows of the noise table
+        :param generator: random number generator that draws the rows of the noise table
         """
         with th.no_grad():
             hidden = self.newest_hidden(batch)
@@ -291,7 +291,7 @@ class SequencePolicy(BasePolicy):
             images by camera, channels first or last
         :param state: state that the last call returned
         :param episode_start: (B,) bool, True where an environment was just reset
-        :param deterministic: repeat exactly for the same model, state and inputs; otherwise draw fresh noise
+        :param deterministic: whether actions repeat exactly for the same model, state and inputs; otherwise noise is fresh
         :return: actions (A,) or (B, A) in the environment's range, of a Discrete space () or (B,), and the next state
         :raises ValueError: not the observation of a `ReturnToGoWrapper`; a number that is not finite or a time step that is
             none, by key and row; a state of other environments, or one that holds no finite numbers
@@ -320,9 +320,9 @@ class SequencePolicy(BasePolicy):
 
     def looks_next(self, state: tuple[np.ndarray, ...]) -> np.ndarray:
         """
-        Return whose next images decide anything. Those of steps with planned actions do not, if the context is one step.
+        Return for which environments the next images matter. With a context of one step, those of planned actions do not.
 
-        :param state: that :meth:`predict` returned
+        :param state: state that :meth:`predict` returned
         :return: (B,) bool
         """
         planned = Context(*state).n_planned > 0
@@ -330,7 +330,7 @@ class SequencePolicy(BasePolicy):
 
     def _unpack(self, observation: Any) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], list[np.ndarray], bool]:
         """
-        :param observation: as for :meth:`predict`
+        :param observation: observation, as for :meth:`predict`
         :return: observation (B, O + F), return-to-go (B,) and time step (B,); vectors and images as they came, (B, ...)
             each; and whether B was there
         """
@@ -365,7 +365,7 @@ class SequencePolicy(BasePolicy):
 
         A pure function, as `predict` with a `state`.
 
-        :param observation: as for :meth:`predict`
+        :param observation: observation, as for :meth:`predict`
         :param state: state that :meth:`decode` or :meth:`predict` returned; None for no past
         :param episode_start: (B,) bool, True where an environment was just reset
         :return: the context with the newest step, and the Transformer's hidden states (B, D)
@@ -384,7 +384,7 @@ class SequencePolicy(BasePolicy):
 
     def decode(self, context: Context, hidden: th.Tensor, noise: np.ndarray) -> tuple[np.ndarray, Context]:
         """
-        The second half: what this noise leads to. Whatever was planned before is dropped.
+        The second half: the actions that this noise leads to. Earlier plans are dropped.
 
         :param context: context that :meth:`encode` returned with `hidden`
         :param hidden: (B, D)
@@ -413,7 +413,7 @@ class SequencePolicy(BasePolicy):
 
         :param context: context that :meth:`encode` returned
         :param chunks: (B, h, A) in [-1, 1], for at least the `n_action_steps` that are carried out
-        :return: as :meth:`decode`
+        :return: actions and the next `state`, as from :meth:`decode`
         :raises ValueError: they are not finite
         """
         context = self._with_chunks(context, np.ones(len(chunks), bool), chunks)
@@ -492,7 +492,7 @@ class SequencePolicy(BasePolicy):
         """
         :param hidden: (b, D)
         :param observations: (b, O) as the environment gives them
-        :param rows: (b,) of the noise table
+        :param rows: rows (b,) of the noise table
         :return: see :meth:`Critic.best_of_n`
         """
         assert self.critic is not None
@@ -544,7 +544,7 @@ class SequencePolicy(BasePolicy):
         """
         Start the noise of `deterministic=False` anew.
 
-        :param seed: None draws one
+        :param seed: seed of the noise; None draws one
         """
         self._acting_generator = th.Generator(self.device)
         if seed is None:
@@ -571,7 +571,7 @@ class SequencePolicy(BasePolicy):
         """
         Choose how to act; the trained weights do not depend on it.
 
-        :param settings: some of :meth:`acting_settings`
+        :param settings: new values of some of :meth:`acting_settings`
         :raises ValueError: an unknown name, or a value out of range
         """
         accepted = self.acting_settings()
@@ -614,9 +614,9 @@ def choose_actions(
     """
     Map hidden states and noise to actions: what `predict` and exported files do alike.
 
-    :param network: that acts
-    :param normalization: of the policy
-    :param online_actor: of a fine-tuned model; None takes the noise and the actions as they are
+    :param network: network that acts
+    :param normalization: the policy's normalization
+    :param online_actor: online actor of a fine-tuned model; None takes the noise and the actions as they are
     :param newest: (B, 1, ...), the newest steps in the environment's units, for the online actor
     :param hidden: (B, D)
     :param noise: (B, N), standard normal

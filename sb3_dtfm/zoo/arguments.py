@@ -19,7 +19,7 @@ from sb3_dtfm.files import CLASSES, EVALUATED, check_settings, literal
 from sb3_dtfm.finetuning import FINETUNED
 from sb3_dtfm.zoo.registration import PACKAGED_CONFIGS, is_packaged, online_config, packaged_config
 
-# In a run's settings.
+# Name of the wrapper in a run's settings.
 WRAPPER = "sb3_dtfm.envs.ReturnToGoWrapper"
 TRAIN_EXAMPLES = """\
   sb3-dtfm train --algo dtfm --env HalfCheetah-v5
@@ -27,9 +27,9 @@ TRAIN_EXAMPLES = """\
 """
 
 
-# In a run's folder: how it was started.
+# File in a run's folder that says how it was started.
 START = "start.json"
-# Task of RL-Zoo where none is named.
+# RL-Zoo's task where none is named.
 RL_ZOO_ENV = "CartPole-v1"
 
 
@@ -41,7 +41,7 @@ def with_target_return(target_return: float | None, env_wrapper: Any) -> list[di
     """
     Wrappers of an environment with its target return.
 
-    :param target_return: environment reward units; None takes what the settings say away
+    :param target_return: target return, environment reward units; None removes that of the settings
     :param env_wrapper: RL-Zoo's setting: a wrapper, its path, one of these with its arguments, a list of these, or None
     :return: the same wrappers with their arguments; a ReturnToGoWrapper follows where there was none
     :raises UsageError: no finite return, or no wrapper
@@ -63,7 +63,7 @@ def with_target_return(target_return: float | None, env_wrapper: Any) -> list[di
 
 def find_target_return(env_wrapper: Any) -> float | None:
     """
-    :param env_wrapper: as in :func:`with_target_return`
+    :param env_wrapper: RL-Zoo's setting, as for :func:`with_target_return`
     :return: the target return of its ReturnToGoWrapper, None where there is none
     """
     own = (arguments for wrapper, arguments in _with_arguments(env_wrapper) if _shows_return_to_go(wrapper))
@@ -97,10 +97,10 @@ def key_values(option: str, texts: Sequence[str], evaluate: Callable[[str], Any]
     """
     Keys with their values.
 
-    :param option: for the message
-    :param texts: `key:value` each
-    :param evaluate: makes a value of its text, by default as RL-Zoo does: Python
-    :raises UsageError: one cannot be evaluated
+    :param option: option that the message names
+    :param texts: texts `key:value`
+    :param evaluate: function from a text to its value; by default it is evaluated as Python, as RL-Zoo does
+    :raises UsageError: a value that cannot be evaluated
     """
     values = {}
     for text in texts:
@@ -139,9 +139,9 @@ class Restored(NamedTuple):
     """
     Arguments beside `--resume RUN`, where all other arguments come from the run's folder.
 
-    :param run: its folder
-    :param packages: of `--gym-packages`
-    :param conf_file: of `--conf-file`, None for none
+    :param run: folder of the run
+    :param packages: packages of `--gym-packages`
+    :param conf_file: file of `--conf-file`, None for none
     """
 
     run: Path
@@ -150,7 +150,7 @@ class Restored(NamedTuple):
 
     def check_package(self, name: str) -> None:
         """
-        :param name: of a module that the run's folder names
+        :param name: name of a module, which the run's folder gives
         :raises UsageError: the user does not name it
         """
         if name not in self.packages:
@@ -161,7 +161,7 @@ class Restored(NamedTuple):
 
     def check_upload(self, arguments: Sequence[str]) -> None:
         """
-        :param arguments: that the run's folder names
+        :param arguments: arguments that the run's folder gives
         :raises UsageError: they would upload the run
         """
         if any(each.startswith("--trac") for each in arguments):  # argparse takes abbreviations
@@ -172,8 +172,8 @@ class Restored(NamedTuple):
 
     def check_config(self, path: str, settings: dict[str, Any] | None = None) -> dict[str, Any]:
         """
-        :param path: of settings that the run's folder names
-        :param settings: what they say, None before they are read
+        :param path: path of settings, which the run's folder gives
+        :param settings: content of that file, None before it is read
         :return: these settings with literals, if they did not come with this package and the user does not name them
         :raises UsageError: such settings would run code
         """
@@ -234,7 +234,7 @@ def restored_arguments(run: Path, others: Sequence[str]) -> Restored | None:
     """
     Arguments beside `--resume`, whose packages are imported; None where there are other arguments.
 
-    :param run: its folder
+    :param run: folder of the run
     :param others: the user's arguments beside `--resume`
     :raises UsageError: no such package
     """
@@ -264,8 +264,8 @@ def repeated_arguments(run: Path, started: list[str], others: Sequence[str]) -> 
     """
     Arguments for RL-Zoo's `train` of a run that is resumed.
 
-    :param run: its folder
-    :param started: what it was started with
+    :param run: folder of the run
+    :param started: arguments that it was started with
     :param others: the user's arguments beside `--resume`: all of them once more
     :raises UsageError: others, of another algorithm or task
     """
@@ -334,7 +334,7 @@ def _no_env(algo: str) -> str:
 
 def check_algorithm(algo: str) -> None:
     """
-    :param algo: RL-Zoo's name
+    :param algo: RL-Zoo's name of an algorithm
     :raises UsageError: it knows none of that name
     """
     known = list(dict.fromkeys([*ALGOS, *ALGORITHMS, FINETUNED]))
@@ -346,7 +346,7 @@ def check_algorithm(algo: str) -> None:
 def check_env_id(env_id: str | None) -> None:
     """
     :param env_id: Gymnasium id, None where RL-Zoo has a default
-    :raises UsageError: names a module, too, which RL-Zoo does not import
+    :raises UsageError: an id with a module, which RL-Zoo does not import
     """
     module, colon, name = (env_id or "").partition(":")
     if colon:
@@ -355,7 +355,7 @@ def check_env_id(env_id: str | None) -> None:
 
 def check_device(device: str | th.device) -> None:
     """
-    :param device: PyTorch's name
+    :param device: PyTorch's name of a device
     :raises UsageError: it knows none of that name
     """
     try:
@@ -382,7 +382,7 @@ def listed_settings(conf_file: str | None, env_id: str) -> dict[str, Any]:
     """
     The settings of a task in a YAML file; none in a file of another kind, or where there is none to read.
 
-    :raises UsageError: no YAML, or something else than settings in it
+    :raises UsageError: a file that is not YAML, or holds something else than settings
     """
     if conf_file is None or not Path(conf_file).is_file() or Path(conf_file).suffix not in (".yml", ".yaml"):
         return {}
@@ -396,9 +396,9 @@ def listed_settings(conf_file: str | None, env_id: str) -> dict[str, Any]:
 
 def read_yaml(path: Path) -> dict[str, Any]:
     """
-    A mapping by task.
+    Read a mapping by task.
 
-    :raises UsageError: no YAML, or something else in it
+    :raises UsageError: a file that is not YAML, or holds something else
     """
     try:
         content = yaml.safe_load(path.read_text())
@@ -411,7 +411,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 def _shorthands(options: argparse.Namespace, settings: dict[str, Any]) -> list[tuple[str, str]]:
     """
-    :param settings: of the task without these options
+    :param settings: settings of the task without these options
     :return: pairs of an option that was given and its `key:value`, whose value RL-Zoo evaluates as Python
     """
     wrapper = with_target_return(options.target_return, settings.get("env_wrapper") or [])
@@ -432,7 +432,7 @@ def at_least(low: int) -> Callable[[str], int]:
     """
     The type of an argument that is a whole number.
 
-    :param low: the smallest one that is accepted
+    :param low: smallest number that is accepted
     """
 
     def number(text: str) -> int:

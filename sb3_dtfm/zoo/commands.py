@@ -34,9 +34,9 @@ class FoundModel(NamedTuple):
     """
     A model in the folder of a run, as RL-Zoo's `get_model_path` tells of it.
 
-    :param prefix: which of the run's models it is, for the names of videos
-    :param path: its zip file
-    :param run: the run's folder
+    :param prefix: name of the model among those of its run, for the names of videos
+    :param path: zip file of the model
+    :param run: folder of the run
     """
 
     prefix: str
@@ -48,11 +48,11 @@ def train(arguments: Sequence[str], resumed: Path | None = None, restored: Resto
     """
     Train through :class:`OfflineExperimentManager`.
 
-    :param arguments: of RL-Zoo's `train`
+    :param arguments: arguments of RL-Zoo's `train`
     :param resumed: folder of an interrupted run to go on with
-    :param restored: where the arguments come from that folder: what the user named beside it
+    :param restored: the user's arguments beside `--resume`, where all others come from that folder
     :raises TrainingError: training failed in its midst
-    :raises SystemExit: SIGTERM has ended it, after what there is was saved
+    :raises SystemExit: SIGTERM has ended it, after the model was saved
     """
     manager = functools.partial(OfflineExperimentManager, arguments=list(arguments), resumed=resumed, restored=restored)
     _train("train", manager, arguments, restored)
@@ -70,15 +70,16 @@ def finetune(
     """
     Go on from a DTFM: by :class:`OnlineManager` where it learns itself, else by :class:`FinetunedManager`.
 
-    :param arguments: of RL-Zoo's `train`
+    :param arguments: arguments of RL-Zoo's `train`
     :param model: zip file of the DTFM, or folder of its run
-    :param target_return: environment reward units; None as in that run
+    :param target_return: target return, environment reward units; None for that of the run
     :param started_with: the command's own arguments
     :param resumed: folder of an interrupted run to go on with
-    :param evaluations_of_a_run: between which a run's timesteps are divided; None where RL-Zoo's arguments say how often
-    :param restored: where the arguments come from that folder: what the user named beside it
+    :param evaluations_of_a_run: number of evaluations at equal shares of a run's timesteps; None where RL-Zoo's
+        `--eval-freq` decides
+    :param restored: the user's arguments beside `--resume`, where all others come from that folder
     :raises TrainingError: training failed in its midst
-    :raises SystemExit: SIGTERM has ended it, after what there is was saved
+    :raises SystemExit: SIGTERM has ended it, after the model was saved
     """
     kind = OnlineManager if arguments[list(arguments).index("--algo") + 1] == ONLINE else FinetunedManager
     goes_on = dict(base=model, target_return=target_return, evaluations_of_a_run=evaluations_of_a_run)
@@ -101,8 +102,8 @@ def enjoy(arguments: Sequence[str], target_return: float | None = None) -> None:
     """
     Act with a trained model, and compare its episodes with those that it learned from.
 
-    :param arguments: of RL-Zoo's `enjoy`
-    :param target_return: environment reward units; None as in the model's run
+    :param arguments: arguments of RL-Zoo's `enjoy`
+    :param target_return: target return, environment reward units; None for that of the model's run
     :raises FileNotFoundError: no such run, or no such model in it
     """
     found: list[tuple[FoundModel, str, EnvironmentName]] = []
@@ -135,8 +136,8 @@ def record_video(model: FoundModel, arguments: Sequence[str]) -> None:
     """
     Film a trained model.
 
-    :param model: to act
-    :param arguments: of RL-Zoo's `record_video`, but for those that choose a model
+    :param model: model that acts
+    :param arguments: arguments of RL-Zoo's `record_video`, but for those that choose a model
     """
     make = functools.partial(_without_pickles, model, arguments[list(arguments).index("--algo") + 1])
     with mock.patch.multiple(rl_zoo3.utils, get_model_path=lambda *_: model, create_test_env=make, StoreDict=StoreValues):
@@ -162,8 +163,8 @@ def plot(name: str, arguments: Sequence[str]) -> None:
     """
     Plot runs.
 
-    :param name: of a script in `rl_zoo3.plots`
-    :param arguments: its arguments
+    :param name: name of a script in `rl_zoo3.plots`
+    :param arguments: arguments of the script
     """
     import rl_zoo3.plots  # it asks for seaborn
 
@@ -176,9 +177,9 @@ def find_model(exp_id: int, folder: str, algo: str, env_name: EnvironmentName, *
     hyperparameters and a run that has just begun have none.
 
     :param exp_id: number of a run, 0 for the latest, -1 for no folder of a run
-    :param folder: of all runs
-    :param algo: of the run
-    :param env_name: of the run
+    :param folder: folder of all runs
+    :param algo: algorithm of the run
+    :param env_name: environment of the run
     :raises FileNotFoundError: no such run, or no such model in it
     """
     ids = [exp_id] if exp_id else _runs(Path(folder, algo), env_name) or [0]

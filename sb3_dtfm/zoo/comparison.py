@@ -22,10 +22,10 @@ N_RANDOM_EPISODES = 5
 
 class RandomActions:
     """
-    Acts at random, where SB3's `evaluate_policy` expects a model.
+    Model that acts at random, for SB3's `evaluate_policy`.
 
-    :param env: whose actions are drawn
-    :param seed: of the draws
+    :param env: environments whose actions are drawn
+    :param seed: seed of the draws
     """
 
     def __init__(self, env: VecEnv, seed: int) -> None:
@@ -45,8 +45,8 @@ class MeasureRandomActions(BaseCallback):
     :class:`~sb3_dtfm.callbacks.SeedEvaluations`.
 
     :param eval_callbacks: the evaluations, of which the first counts
-    :param seed: of the actions
-    :param after_step: called after each step
+    :param seed: seed of the actions
+    :param after_step: function called after each step
     """
 
     def __init__(self, eval_callbacks: list[EvalCallback], seed: int, after_step: Callable[..., None] | None = None) -> None:
@@ -70,10 +70,10 @@ class MeasureRandomActions(BaseCallback):
 
 class EpisodesOf(VecEnvWrapper):
     """
-    Keeps the returns and successes of an environment's episodes.
+    Wrapper that keeps the returns and successes of an environment's episodes.
 
-    :ivar returns: of the episodes that have ended, environment reward units
-    :ivar successes: whether they succeeded; empty where the task does not tell
+    :ivar returns: returns of the episodes that have ended, environment reward units
+    :ivar successes: whether each of them succeeded; empty where the task does not tell
     """
 
     def __init__(self, venv: VecEnv) -> None:
@@ -102,11 +102,11 @@ def compare(
     If they reach less than nine tenths of the goal, suggestions follow: longer training, and a sweep where the model
     looks at a target return.
 
-    :param attributes: of the model, or of its file; `target_return` is that of these episodes
-    :param returns: of its episodes, environment reward units
-    :param successes: whether they succeeded; none where the task does not tell
+    :param attributes: attributes of the model, or of its file; `target_return` is that of these episodes
+    :param returns: returns of its episodes, environment reward units
+    :param successes: whether each of them succeeded; empty where the task does not tell
     :param run: folder of its run
-    :param env_name: of its environment
+    :param env_name: name of its environment
     :return: sentences; none where there are no episodes, or where the model does not know what was recorded
     """
     if attributes.get("return_reference") is None or not len(returns):

@@ -40,10 +40,11 @@ class FinetunedCallbacks(BaseCallback):
 
     Until the algorithm has learned, that is the model without an actor: the curve begins at the offline policy's score.
 
-    :param finetuned: acts by the algorithm's actor whenever it is looked at
-    :param callbacks: to run with it
-    :param seed: of the run, which evaluations are seeded by
-    :param signals: where one has interrupted the training, the end is not evaluated: what there is is to be saved at once
+    :param finetuned: model that acts by the algorithm's actor whenever a callback looks at it
+    :param callbacks: callbacks to run with it
+    :param seed: seed of the run, and of its evaluations
+    :param signals: signals to stop; where one has interrupted the training, its end is not evaluated, and the model is saved
+        at once
     """
 
     def __init__(self, finetuned: FinetunedDTFM, callbacks: list[BaseCallback], seed: int, signals: StopSignals) -> None:
@@ -101,7 +102,7 @@ def keep_one_action(policy: SequencePolicy, residual: bool) -> None:
     """
     Have a model act in a way that leaves an algorithm something to choose.
 
-    :param policy: of the model
+    :param policy: policy of the model
     :param residual: whether residual actions are learned, not noise
     """
     if not residual and policy.network.head.noise_dim and not policy.network.head.noise_decides:
@@ -122,11 +123,11 @@ class FinetuningManager(OfflineExperimentManager):
     RL-Zoo's own manager, for what goes on from a DTFM in the environment of that DTFM's run.
 
     :param base: file of the DTFM, or folder of its run
-    :param target_return: environment reward units; by default as in that run, or what the file tells
-    :param evaluations_of_a_run: after equal shares of the timesteps; None where `eval_freq` says how often
+    :param target_return: target return, environment reward units; that of the run, or of the file, by default
+    :param evaluations_of_a_run: number of evaluations at equal shares of the timesteps; None where `eval_freq` decides
     """
 
-    of_the_data: tuple[str, ...] = ()  # and other settings of that run that count here, too
+    of_the_data: tuple[str, ...] = ()  # further settings of that run that count here
 
     def __init__(
         self,
@@ -284,7 +285,7 @@ class FinetunedManager(FinetuningManager):
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
         """
-        The fine-tuned model where RL-Zoo looks for one, and the algorithm beside it, to go on with.
+        Save the fine-tuned model where RL-Zoo looks for one, and the algorithm beside it, to go on with.
 
         :param model: the online algorithm
         :raises SystemExit: SIGTERM has ended the run
@@ -323,8 +324,8 @@ class OnlineManager(FinetuningManager):
             )
         if not self.has_checkpoint:
             self.trained_agent, self.continue_training = str(self.base_file), True
-        self.save_replay_buffer = False  # it is, as episodes.npz
-        self.signals.between_steps = False  # of which a round has many, and none is repeated to the bit anyway
+        self.save_replay_buffer = False  # it is saved as episodes.npz
+        self.signals.between_steps = False  # a round has many steps, and none is repeated to the bit anyway
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """
@@ -371,7 +372,7 @@ class OnlineManager(FinetuningManager):
         """
         Save the model as RL-Zoo does, and the own episodes.
 
-        :param model: trained
+        :param model: trained model
         :raises SystemExit: SIGTERM has ended the run
         """
         assert isinstance(model, OnlineDTFM)

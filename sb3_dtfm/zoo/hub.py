@@ -32,8 +32,8 @@ class Settings(NamedTuple):
 
     :param algo: a key of `ALGORITHMS`
     :param env: Gymnasium id
-    :param target_return: in reward units
-    :param env_kwargs: of ``gymnasium.make``, values of JSON
+    :param target_return: target return in reward units
+    :param env_kwargs: arguments of ``gymnasium.make``, values of JSON
     """
 
     algo: str
@@ -48,7 +48,7 @@ class Settings(NamedTuple):
 
     def write(self, folder: Path) -> None:
         """
-        :param folder: of the repository
+        :param folder: folder of the repository
         :raises UsageError: `env_kwargs` with something else than values of JSON
         """
         try:
@@ -65,7 +65,7 @@ class Settings(NamedTuple):
         """
         Read what others wrote as data, and check it.
 
-        :param folder: of the repository
+        :param folder: folder of the repository
         :raises FileNotFoundError: `sb3-dtfm push` did not make it
         :raises ValueError: something else than settings
         """
@@ -101,9 +101,9 @@ class Result(NamedTuple):
     """
     Result of an evaluation.
 
-    :param mean_reward: over the episodes
-    :param std_reward: over the episodes
-    :param n_episodes: how many
+    :param mean_reward: mean return of the episodes, reward units
+    :param std_reward: standard deviation of their returns
+    :param n_episodes: number of episodes
     """
 
     mean_reward: float
@@ -115,7 +115,7 @@ def target_return_of(hyperparams: Mapping[str, Any]) -> float:
     """
     A run's target return. RL-Zoo imports and calls what `env_wrapper` names, so a repository holds this number alone.
 
-    :param hyperparams: of the run
+    :param hyperparams: settings of the run
     :raises UsageError: it acts behind another wrapper
     """
     wrappers = hyperparams.get("env_wrapper")
@@ -131,12 +131,12 @@ def write_card(
     """
     Write the model card: how to get the model, what it reached, what it was trained with.
 
-    :param folder: of the repository
+    :param folder: folder of the repository
     :param repo_id: organisation/name
-    :param settings: of acting
-    :param hyperparams: of training; of absolute paths among them the card shows the last part
-    :param result: of an evaluation
-    :param has_video: whether there is one in the repository
+    :param settings: settings of acting
+    :param hyperparams: settings of training; the card shows absolute paths among them by their last part
+    :param result: result of an evaluation
+    :param has_video: whether there is a video in the repository
     """
     algorithm = ALGORITHMS[settings.algo].__name__
     score = EvalResult(
@@ -190,17 +190,17 @@ print(evaluate_policy(model, env, n_eval_episodes=10, warn=False))
 
 def upload(folder: Path, repo_id: str, message: str) -> str:
     """
-    :param folder: all of it is uploaded
+    :param folder: folder to upload as a whole
     :param repo_id: organisation/name, made if there is none
-    :param message: of the commit
-    :return: address
+    :param message: message of the commit
+    :return: address of the repository
     :raises HubError: no network, no right to write
     """
     try:
         api = HfApi()
         url = api.create_repo(repo_id, exist_ok=True)
         api.upload_folder(repo_id=repo_id, folder_path=folder, commit_message=message)
-    except Exception as error:  # of the hub's client and of what it talks with
+    except Exception as error:  # the hub's client and its connection raise many kinds
         raise HubError(
             f"{repo_id}: {_reason(error)}; `hf auth login` lets you in, --repo-folder writes a folder."
         ) from error
@@ -223,7 +223,7 @@ def add_repository_arguments(parser: argparse.ArgumentParser) -> None:
     """
     RL-Zoo's arguments that name a repository, and that of a folder.
 
-    :param parser: gets them
+    :param parser: parser that gets them
     """
     argument = parser.add_argument
     argument("-orga", "--organization", required=True, help="user or organisation on the hub")
@@ -233,7 +233,7 @@ def add_repository_arguments(parser: argparse.ArgumentParser) -> None:
 
 def repository_id(options: argparse.Namespace) -> str:
     """
-    :param options: with the arguments of :func:`add_repository_arguments`, algo and env
+    :param options: parsed arguments of :func:`add_repository_arguments`, algo and env
     :raises UsageError: an unknown algorithm, or one whose files are pickles
     """
     check_algorithm(options.algo)
@@ -248,7 +248,7 @@ def repository_id(options: argparse.Namespace) -> str:
 def copy_model(source: Path, target: Path) -> None:
     """
     :param source: zip file of a model
-    :param target: replaced if it is there
+    :param target: file to write, replaced if it is there
     """
     with replacing(target) as path:
         shutil.copyfile(source, path)

@@ -38,11 +38,11 @@ from sb3_dtfm.zoo.comparison import MeasureRandomActions, compare
 from sb3_dtfm.zoo.registration import with_policy_options
 from sb3_dtfm.zoo.resuming import CHECKPOINT, KeepCheckpoint, ReplaceEvaluations, Start, StopSignals, go_on
 
-# Keys of its YAML files that no algorithm sees.
+# Keys of RL-Zoo's YAML files that no algorithm sees.
 OF_RL_ZOO = ("n_timesteps", "n_envs", "normalize", "frame_stack", "callback", "env_wrapper", "vec_env_wrapper", "env_kwargs")
 
 
-# Those that it reads as schedules: a number, or as lin_0.001 one that falls to 0.
+# Keys that RL-Zoo reads as schedules: a number, or text such as lin_0.001 for one that falls to 0.
 SCHEDULES = frozenset({"learning_rate", "clip_range", "clip_range_vf", "delta_std"})
 
 
@@ -68,9 +68,9 @@ class OfflineExperimentManager(ExperimentManager):
     - dt and dtfm keep a checkpoint while they train, and an interrupted run resumes from it.
     - The last evaluation is compared with the recorded episodes.
 
-    :param arguments: what the command was called with
+    :param arguments: arguments of the command
     :param resumed: folder of a run to go on with, instead of a new one
-    :param restored: where the arguments come from that folder: what the user named beside it
+    :param restored: the user's arguments beside `--resume`, where all others come from that folder
     """
 
     command = "train"
@@ -87,7 +87,7 @@ class OfflineExperimentManager(ExperimentManager):
         self.restored = restored
         self._check_options()
         self.trial_id = None if self.trial_id is None else TrialNumber(self.trial_id)
-        if resumed is not None and self.algo not in ALGORITHMS:  # whose checkpoints are pickles
+        if resumed is not None and self.algo not in ALGORITHMS:  # other checkpoints are pickles
             raise UsageError(f"--resume {resumed}: runs of {' and '.join(ALGORITHMS)} go on, none of --algo {self.algo}.")
         if resumed is not None and self.optimize_hyperparameters:
             raise UsageError(f"--resume {resumed}: -optimize continues by its --storage and --study-name.")
@@ -138,7 +138,7 @@ class OfflineExperimentManager(ExperimentManager):
 
     def _check_settings(self, hyperparams: dict[str, Any]) -> None:
         """
-        :raises UsageError: a setting that RL-Zoo reads itself is none
+        :raises UsageError: an invalid value of a setting that RL-Zoo reads itself
         """
         if not COUNT.accepts(hyperparams.get("n_envs", 1)):
             raise UsageError(f"n_envs must be {COUNT}, got {hyperparams['n_envs']!r}.")
@@ -153,7 +153,7 @@ class OfflineExperimentManager(ExperimentManager):
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Read settings as RL-Zoo does; policy options may stand among them, and the ReturnToGoWrapper may be left out."""
-        listed_settings(self.config, self.env_name.gym_id)  # whose errors name the file
+        listed_settings(self.config, self.env_name.gym_id)  # its errors name the file
         try:
             hyperparams, saved = super().read_hyperparameters()
         except IndexError as error:
@@ -206,8 +206,8 @@ class OfflineExperimentManager(ExperimentManager):
         """
         Write into the run's settings which target return its environment got from the data, for whoever acts with the model.
 
-        :param model: with its environment
-        :param saved: the settings
+        :param model: model with its environment
+        :param saved: settings of the run
         """
         assert model.env is not None
         saved["env_wrapper"] = with_target_return(model.env.get_attr("target_return")[0], saved["env_wrapper"])
@@ -215,8 +215,8 @@ class OfflineExperimentManager(ExperimentManager):
 
     def _check_names(self, error: TypeError) -> None:
         """
-        :param error: what the algorithm's constructor raised
-        :raises UsageError: because of a hyperparameter that it does not have
+        :param error: error that the algorithm's constructor raised
+        :raises UsageError: a hyperparameter that it does not have
         """
         known = [*inspect.signature(ALGOS[self.algo]).parameters, *OF_RL_ZOO]
         unknown = sorted(set(self._hyperparams) - set(known))
@@ -258,7 +258,7 @@ class OfflineExperimentManager(ExperimentManager):
             self.callbacks = []
             return
         n_envs = self.n_envs
-        self.n_envs = 1 if self.learns_offline else n_envs  # by which RL-Zoo divides the intervals
+        self.n_envs = 1 if self.learns_offline else n_envs  # RL-Zoo divides the intervals by it
         super().create_callbacks()
         self.n_envs = n_envs
         if self.algo not in ALGORITHMS or self.optimize_hyperparameters:
@@ -281,8 +281,8 @@ class OfflineExperimentManager(ExperimentManager):
         """
         Train as RL-Zoo does; a run that is resumed has the rest of its steps before it.
 
-        :param model: to train
-        :raises TrainingError: whatever went wrong
+        :param model: model to train
+        :raises TrainingError: any error in the training
         :raises UsageError: another process is training the run that is to be resumed
         """
         if self.keeper is not None:
@@ -314,7 +314,7 @@ class OfflineExperimentManager(ExperimentManager):
         """
         Save the model as RL-Zoo does. An interrupted run keeps what it can go on from, a finished one does not.
 
-        :param model: trained
+        :param model: trained model
         :raises SystemExit: SIGTERM has ended the run
         """
         super().save_trained_model(model)

@@ -25,14 +25,14 @@ def draw(name: str, arguments: Sequence[str]) -> list[Path]:
     Run one of RL-Zoo's plotting scripts. With `--figures FOLDER`, or without a screen, each figure becomes a PNG file.
 
     :param name: plot_train, all_plots or plot_from_file
-    :param arguments: of the script, and `--figures`
+    :param arguments: arguments of the script, and `--figures`
     :return: the files, none where windows were shown
     :raises UsageError: training episodes are asked for of an algorithm that is unknown or has none
     """
     folder, others = _folder(arguments)
     if name == "plot_train":
         _check_that_it_acts_while_it_learns(others)
-    if folder is None and plt.get_backend().lower() == "agg":  # what Matplotlib takes where there is no screen
+    if folder is None and plt.get_backend().lower() == "agg":  # Matplotlib takes it where there is no screen
         folder = Path()
     if folder is not None:
         plt.switch_backend("agg")

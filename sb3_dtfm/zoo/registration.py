@@ -27,7 +27,7 @@ def register() -> None:
     """
     Add the algorithms in place, so that RL-Zoo's functions see them wherever they were imported.
 
-    So do tasks of gymnasium-robotics, which RL-Zoo does not know.
+    Tasks of gymnasium-robotics, which RL-Zoo does not know, are registered, too.
     """
     register_gymnasium_robotics()
     ALGOS.update({**ALGORITHMS, FINETUNED: FinetunedDTFM})
@@ -40,7 +40,7 @@ def packaged_config(algo: str, name: str | None = None) -> Path:
     Hyperparameter file that comes with the package.
 
     :param algo: a key of `ALGORITHMS`; DT's settings, those of the Transformer, serve a head without a file of its own
-    :param name: None for the recommended settings, "paper" for those of the method's paper
+    :param name: name of the settings: None for the recommended ones, "paper" for those of the method's paper
     """
     folder = resources.files(PACKAGED_CONFIGS[name])
     own = Path(str(folder.joinpath(f"{algo}.yml")))
@@ -52,7 +52,7 @@ def online_config(algo: str, env_id: str) -> str | None:
     Hyperparameter file that comes with the package for a task of its own, which RL-Zoo does not list.
 
     :param algo: RL-Zoo's name of an online algorithm
-    :return: None where there is none
+    :return: path of the file, None where there is none
     """
     path = Path(str(resources.files(PACKAGED_CONFIGS[None]).joinpath(f"{algo}.yml")))
     return str(path) if path.is_file() and env_id in yaml.safe_load(path.read_text()) else None
@@ -67,8 +67,8 @@ def finetuning_config(algo: str) -> Path:
     """
     Hyperparameter file that comes with the package, of an algorithm that `finetune` takes.
 
-    :param algo: RL-Zoo's name
-    :raises ValueError: there is none
+    :param algo: RL-Zoo's name of the algorithm
+    :raises ValueError: an algorithm without packaged settings
     """
     folder = Path(str(resources.files(FINETUNING_CONFIGS)))
     found = {path.stem: path for path in sorted(folder.glob("*.yml"))}
@@ -93,8 +93,8 @@ def convert_params(algo: str, sampled_params: dict[str, Any]) -> dict[str, Any]:
     RL-Zoo lets a trial's `policy_kwargs` replace the YAML's as a whole, so the search covers all that the packaged settings
     choose there.
 
-    :param algo: unused, as options of the policy have the same names for all
-    :param sampled_params: as Optuna stores them: flat, powers of two by their exponent
+    :param algo: unused name of the algorithm, as options of the policy have the same names for all
+    :param sampled_params: parameters as Optuna stores them: flat, powers of two by their exponent
     """
     params = {
         name.removesuffix("_pow"): 2**value if name.endswith("_pow") else value for name, value in sampled_params.items()
@@ -127,17 +127,17 @@ def sample_params(
     Search space: the Transformer's, the same for all algorithms, and the head's own.
 
     :param algo: a key of `ALGORITHMS`
-    :param trial: the trial that draws
-    :param n_actions: unused, as the next two: RL-Zoo gives them to every search
-    :param n_envs: unused
-    :param additional_args: unused
+    :param trial: Optuna's trial, which draws
+    :param n_actions: unused number of actions; RL-Zoo gives it and the next two to every search
+    :param n_envs: unused number of environments
+    :param additional_args: unused further arguments
     :return: constructor arguments
     """
     return convert_params(algo, {**_sample_transformer(trial), **policy_of(algo).head_class.search_space(trial)})
 
 
 def _sample_transformer(trial: optuna.Trial) -> dict[str, Any]:
-    """Shared by both algorithms: optimiser, context and Transformer."""
+    """Draw what both algorithms share: optimiser, context and Transformer."""
     return {
         "learning_rate": trial.suggest_float("learning_rate", 3e-5, 3e-3, log=True),
         "batch_size_pow": trial.suggest_int("batch_size_pow", 5, 8),

@@ -9,9 +9,9 @@ from collections.abc import Iterator
 
 import mujoco
 
-# As MuJoCo names them in MUJOCO_GL: a GPU or Mesa without a screen, a CPU alone, a window of a screen that there is.
+# Values of MUJOCO_GL: a GPU or Mesa without a screen, a CPU alone, or a window on a screen.
 RENDERERS = ("egl", "osmesa", "glfw")
-# In a process of its own: what fails to load stays half loaded, and only one of them can be loaded.
+# Tried in a process of its own: a renderer that fails stays half loaded, and only one can be loaded.
 ATTEMPT = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).render()"
 ATTEMPT_LIMIT = 120  # seconds; a busy machine needs some for the import
 ADVICE = (

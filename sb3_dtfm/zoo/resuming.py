@@ -24,11 +24,11 @@ from sb3_dtfm.files import read_evaluations, replacing
 from sb3_dtfm.finetuning import OnlineDTFM
 from sb3_dtfm.zoo.arguments import START, UsageError
 
-# In a run's folder while it is unfinished: the model as it was; START beside it says how the run was started.
+# File in an unfinished run's folder with the model as it was; START beside it says how the run was started.
 CHECKPOINT = "checkpoint.zip"
-# Held by the process that trains it.
+# Lock of the process that trains the run.
 LOCK = ".lock"
-# Beside a model that learns online: its own episodes.
+# File beside a model that learns online, with its own episodes.
 EPISODES = "episodes.npz"
 # Online algorithm of a run of "finetuned", as Stable-Baselines3 saves it.
 AGENT = "agent"
@@ -40,10 +40,10 @@ class Start(NamedTuple):
     """
     The start of a run.
 
-    :param arguments: of RL-Zoo's `train`, or those of the command
+    :param arguments: arguments of RL-Zoo's `train`, or those of the command
     :param tensorboard: folder of its curves, None for none
     :param command: "train" or "finetune"
-    :param has_checkpoint: it has been saved since then; without, the run begins anew
+    :param has_checkpoint: whether a checkpoint has been saved since then; without one the run begins anew
     """
 
     arguments: list[str]
@@ -62,7 +62,7 @@ class Start(NamedTuple):
     def read(cls, run: Path, command: str = "train") -> "Start":
         """
         :param run: the run's folder
-        :param command: that is to go on with it
+        :param command: command that is to go on with it
         :raises UsageError: no run of this package's, or of another command, or one that is finished or lacks its checkpoint
         """
         if not run.is_dir():
@@ -103,7 +103,7 @@ class StopSignals:
 
     The second one interrupts at once. Several processes that train together leave the signals' handlers alone.
 
-    :param between_steps: False where `asked` is not read between steps: the first one interrupts at once, too
+    :param between_steps: whether `asked` is read between steps; otherwise the first one interrupts at once, too
     """
 
     def __init__(self, between_steps: bool) -> None:
@@ -129,7 +129,7 @@ class StopSignals:
         """
         Have the signals end an evaluation, too; a resumed run repeats it.
 
-        :param evaluation: whenever it runs
+        :param evaluation: callback whose evaluations they end
         """
         count_successes: Any = evaluation._log_success_callback
 
@@ -141,9 +141,9 @@ class StopSignals:
 
     def end_evaluation(self, *_: Any) -> None:
         """
-        End an evaluation between two of its steps, as `evaluate_policy` calls it.
+        End an evaluation between two of its steps, where `evaluate_policy` calls this.
 
-        :raises KeyboardInterrupt: one of them has come
+        :raises KeyboardInterrupt: a signal has come
         """
         if self.asked:
             raise KeyboardInterrupt
@@ -159,11 +159,11 @@ class StopSignals:
 
 class KeepCheckpoint(BaseCallback):
     """
-    Saves the model now and then, and ends training where that was asked for. Put it behind all other callbacks.
+    Callback that saves the model now and then, and ends training on a signal. Put it behind all other callbacks.
 
     :param run: the run's folder
-    :param signals: that may ask for an end
-    :param start: how the run was started
+    :param signals: signals that may ask for an end
+    :param start: start of the run
     """
 
     def __init__(self, run: Path, signals: StopSignals, start: Start) -> None:
@@ -171,7 +171,7 @@ class KeepCheckpoint(BaseCallback):
         self.path = run / CHECKPOINT
         self.signals = signals
         self.start = start
-        self.ended = False  # training has, by itself
+        self.ended = False  # True when training has ended by itself
         self._lock = FileLock(run / LOCK)
         self._saved_at = 0.0
         self._ending = False
@@ -214,11 +214,11 @@ class KeepCheckpoint(BaseCallback):
             self.model.save_replay_buffer(self.path.with_name(EPISODES))
         self.model.save(self.path)
         self.start = self.start._replace(has_checkpoint=True)
-        self._write_start()  # which is not there yet if the first evaluation was ended
+        self._write_start()  # it is not there yet if the first evaluation was ended
         self._saved_at = time.monotonic()
 
     def remove(self) -> None:
-        """The run is finished: nothing to go on from."""
+        """Remove the checkpoint of a finished run, which has nothing to go on from."""
         self.path.unlink(missing_ok=True)
         (self.path.parent / START).unlink(missing_ok=True)
 
@@ -277,9 +277,9 @@ def go_on(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], start: Start)
     """
     Have logs and evaluations of a run follow those that there are, as far as the checkpoint.
 
-    :param model: of the checkpoint, or new where there was none
-    :param callbacks: of the run
-    :param start: how it was started
+    :param model: model of the checkpoint, or a new one where there was none
+    :param callbacks: callbacks of the run
+    :param start: start of the run
     :raises UsageError: evaluations are missing
     """
     n_steps = model.num_timesteps
@@ -309,7 +309,7 @@ def _restore_evaluations(callback: EvalCallback, path: Path, num_timesteps: int)
     """
     Keep the evaluations up to the checkpoint; the run comes to the others again.
 
-    :raises UsageError: there are none to tell how good the best model is
+    :raises UsageError: no evaluations that tell how good the best model is
     """
     try:
         saved = read_evaluations(path)

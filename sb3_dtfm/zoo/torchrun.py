@@ -23,7 +23,7 @@ def joined_processes(arguments: Sequence[str]) -> Iterator[list[str]]:
 
     A process that fails leaves without a word to the others: torchrun ends them.
 
-    :param arguments: for RL-Zoo's `train`
+    :param arguments: arguments for RL-Zoo's `train`
     :return: arguments for `train` on this process
     :raises UsageError: several processes cannot do this together
     """
@@ -77,7 +77,7 @@ def _interrupt_once(*_: Any) -> NoReturn:
     """
     Ctrl-C reaches a process twice, from the terminal and from torchrun.
 
-    :raises KeyboardInterrupt: on which RL-Zoo saves the model; the second one must not interrupt that
+    :raises KeyboardInterrupt: always; RL-Zoo then saves the model, which the second one must not interrupt
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     raise KeyboardInterrupt

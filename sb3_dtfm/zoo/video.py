@@ -29,8 +29,8 @@ def models_of_training(run: Path, algo: str, env_name: EnvironmentName) -> list[
     All models of a run in the order of RL-Zoo's `record_training`: checkpoints by their steps, the last model, the best.
 
     :param run: the run's folder
-    :param algo: of the run
-    :param env_name: of the run
+    :param algo: algorithm of the run
+    :param env_name: environment of the run
     """
     checkpoints = [(int(re.findall(r"\d+", path.name)[0]), path) for path in run.glob("rl_model_*_steps.zip")]
     found = [(f"checkpoint-{n_steps}", path) for n_steps, path in sorted(checkpoints)]
@@ -43,9 +43,9 @@ def film(models: Sequence[FoundModel], arguments: Sequence[str], output: Path) -
     """
     Let models act, and write one video of all of them.
 
-    :param models: at least one; where there are several, each one's part says which it is
-    :param arguments: of RL-Zoo's `record_video`, but for those that choose models and folders
-    :param output: an .mp4 or .gif file, replaced if it is there
+    :param models: models to film, at least one; where there are several, a title names the model of each part
+    :param arguments: arguments of RL-Zoo's `record_video`, but for those that choose models and folders
+    :param output: .mp4 or .gif file, replaced if it is there
     :raises UsageError: another ending
     :raises RenderingError: no picture can be drawn on this machine as it is
     """
@@ -70,8 +70,8 @@ def with_env_kwargs(model: FoundModel, arguments: Sequence[str]) -> list[str]:
     """
     Arguments of `record_video` with those of the environment that the run's settings have, which it does not read itself.
 
-    :param model: of the run
-    :param arguments: the user's, whose own `--env-kwargs` count where both have one
+    :param model: model of the run
+    :param arguments: the user's arguments, whose own `--env-kwargs` count where both have one
     """
     runs = [read_run(path.parent) for path in Path(model.run).glob("*/config.yml")]  # none of an agent from elsewhere
     words = [f"{name}:{value!r}" for run in runs for name, value in (run.get("env_kwargs") or {}).items()]
@@ -84,10 +84,10 @@ def with_env_kwargs(model: FoundModel, arguments: Sequence[str]) -> list[str]:
 
 def _write(parts: Sequence[Path], titles: Sequence[str], output: Path, ending: str, folder: str) -> None:
     """
-    One video of several.
+    Write one video of several.
 
-    :param titles: a line for each part, or none at all
-    :param folder: where the font is
+    :param titles: line for each part, or none at all
+    :param folder: folder of the font
     """
     streams = [f"[{i}:v]null[v{i}]" for i in range(len(parts))]
     for i, title in enumerate(titles):
@@ -117,7 +117,7 @@ def add_model_arguments(parser: argparse.ArgumentParser) -> None:
     """
     RL-Zoo's arguments that choose a model.
 
-    :param parser: gets them
+    :param parser: parser that gets them
     """
     argument = parser.add_argument
     argument("--algo", required=True, help="dt, dtfm, sac, ...")
@@ -133,7 +133,7 @@ def add_model_arguments(parser: argparse.ArgumentParser) -> None:
 
 def chosen_model(options: argparse.Namespace) -> FoundModel:
     """
-    :param options: with the arguments of :func:`add_model_arguments`
+    :param options: parsed arguments of :func:`add_model_arguments`
     :raises FileNotFoundError: no such run, or no such model in it
     """
     which = options.load_best, options.load_checkpoint, options.load_last_checkpoint

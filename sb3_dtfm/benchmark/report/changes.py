@@ -1,4 +1,4 @@
-"""Changes of `--label`s: the settings that differ from the profile's own, and what became of the results."""
+"""Changes of `--label`s: the settings that differ from the profile's own, and the runs to compare."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,8 +15,8 @@ def split_changes(study: Study, studies: Sequence[Study]) -> tuple[list[Group], 
 
     A label that was run for several algorithms, on other data perhaps, compares them anew; for one, it changes a setting.
 
-    :param studies: all of them; where the study has no runs without a label, those of another one serve
-    :return: the former; and each group without a label, with its labelled ones if it has any
+    :param studies: all studies; where this one has no runs without a label, those of another one serve
+    :return: groups that stand for themselves; and each group without a label that has labelled ones, with these
     """
     everywhere = [group for each in [*studies, study] for group in each.groups]
     plain = {group.profile: group for group in everywhere if not group.label}
@@ -49,7 +49,7 @@ def changed_settings(run: Run, base: Sequence[Run]) -> str:
 
 
 def _flat(settings: dict[str, Any]) -> dict[str, Any]:
-    """`policy_kwargs` and `dataset_kwargs` beside the others, and the target return out of its wrapper."""
+    """Put `policy_kwargs` and `dataset_kwargs` beside the other settings, and take the target return out of its wrapper."""
     apart = ("policy_kwargs", "dataset_kwargs", "env_wrapper")
     flat = {key: value for key, value in settings.items() if key not in apart}
     flat.update({**(settings.get("policy_kwargs") or {}), **(settings.get("dataset_kwargs") or {})})

@@ -49,8 +49,8 @@ class Baseline(NamedTuple):
     """
     Evaluations of another SB3 run.
 
-    :param task: what it was trained on, None where the figure has a single task
-    :param name: for the legend
+    :param task: task that it was trained on, None where the figure has a single task
+    :param name: name in the legend
     :param steps: environment steps (E,)
     :param returns: mean return (E,)
     :param successes: success rate in percent (E,), None where it was not evaluated
@@ -67,8 +67,8 @@ def read_baseline(text: str) -> Baseline:
     """
     A baseline from `[TASK:]NAME=FILE`.
 
-    :param text: FILE is the `evaluations.npz` of an SB3 run
-    :raises ValueError: malformed
+    :param text: text of this form; FILE is the `evaluations.npz` of an SB3 run
+    :raises ValueError: malformed text
     :raises FileNotFoundError: no such file
     """
     label, separator, file = text.partition("=")
@@ -101,9 +101,10 @@ def plot_group(
 
     :param group: the runs
     :param output: PNG file to write
-    :param x: what to draw them against: gradient "steps", or "minutes" of training without evaluations
+    :param x: horizontal axis: gradient "steps", or "minutes" of training without evaluations
     :param baselines: further curves
-    :param agent_line: draw the mean return of the recorded episodes; against minutes 95 % of it, or of success
+    :param agent_line: whether to draw the mean return of the recorded episodes; by minutes the threshold, see
+        :attr:`Run.threshold`
     :return: `output`
     """
     with _figure(group, group.tasks, output, X_AXES[x][0]) as axes:
@@ -269,9 +270,9 @@ def _draw_panel(
 
 def _draw_baseline(axis: "Axes", baseline: Baseline, last_step: int, color: str, by_success: bool) -> None:
     """
-    Stretched over the panel: environment steps are no gradient steps, and the legend says how many they are.
+    Stretch a baseline over the panel: environment steps are no gradient steps, and the legend says how many they are.
 
-    :raises ValueError: it has no successes, and the task counts them
+    :raises ValueError: a baseline without successes, where the task counts them
     """
     values = baseline.successes if by_success else baseline.returns
     if values is None:

@@ -1,4 +1,4 @@
-"""Training runs made of results: what each achieved, and how runs of several seeds are summed up."""
+"""Training runs made of results: the achievement of each, and summaries of several seeds."""
 
 import math
 import os
@@ -25,7 +25,7 @@ class Run(NamedTuple):
     """
     One training run.
 
-    :param key: what it is known by
+    :param key: identity of the run
     :param evaluations: results of the evaluations before and during training, by gradient step
     :param final: result of the final evaluation
     """
@@ -64,7 +64,7 @@ class Run(NamedTuple):
 
     def to_score(self, value: float) -> float | None:
         """
-        A value on the scale from what scores 0 to what scores 1.
+        A value on the scale of scores, from the reference of 0 to that of 1.
 
         :param value: success in percent, or mean return in reward units
         :return: None where there is no scale
@@ -87,7 +87,7 @@ class Run(NamedTuple):
         Reference of score 1: the successes of the best tenth of the recorded episodes, in percent, or 100 if unknown;
         without successes the mean return of the best tenth, or of all where that of random actions is not known.
 
-        :return: None where that is not known, or not above what scores 0
+        :return: None where that is not known, or not above the reference of 0
         """
         data = self.final["data"]
         if self.counts_success:
@@ -97,7 +97,7 @@ class Run(NamedTuple):
 
     @property
     def threshold(self) -> float | None:
-        """95 % of the way from what scores 0 to what scores 1; None where there is no scale."""
+        """95 % of the way from the reference of score 0 to that of score 1; None where there is no scale."""
         return None if self.scale is None else self.zero + THRESHOLD * (self.scale - self.zero)
 
     @property
@@ -134,11 +134,11 @@ class Curve(NamedTuple):
     A learning curve of several runs.
 
     :param steps: gradient steps (E,)
-    :param minutes: of training until then, mean over runs (E,)
-    :param mean: over runs, success in percent or return in reward units (E,)
+    :param minutes: minutes of training until then, mean over runs (E,)
+    :param mean: mean over runs of success in percent, or of return in reward units (E,)
     :param low: limit of a band around it (E,)
-    :param high: the other limit (E,)
-    :param band: what the band is
+    :param high: other limit of that band (E,)
+    :param band: name of the band
     """
 
     steps: np.ndarray
@@ -154,9 +154,9 @@ class Group(NamedTuple):
     All runs of one profile and label in a study: one part of the report.
 
     :param profile: name of the settings
-    :param label: name of what else was changed
-    :param tasks: those that the table shows, run or not
-    :param runs: by task, share of the data and algorithm, in the order of seeds
+    :param label: name of further changes, "" for none
+    :param tasks: tasks that the table shows, run or not
+    :param runs: runs by task, share of the data and algorithm, in the order of seeds
     """
 
     profile: str
@@ -223,8 +223,8 @@ class Study(NamedTuple):
     """
     Content of one folder or table of results.
 
-    :param name: of the folder or table, "" for what was named itself
-    :param groups: its runs by profile and label
+    :param name: name of the folder or table, "" for results that were named themselves
+    :param groups: groups of its runs by profile and label
     :param unfinished: runs left out because they have no final evaluation
     """
 
@@ -237,8 +237,8 @@ def read_studies(paths: Iterable[str | os.PathLike[str]], tasks: Sequence[str] =
     """
     The studies in tables, and in files and folders of rows; those with runs of a profile as it is come first.
 
-    :param paths: see :func:`~sb3_dtfm.benchmark.results.read_results`
-    :param tasks: see :func:`group_runs`
+    :param paths: paths of results, see :func:`~sb3_dtfm.benchmark.results.read_results`
+    :param tasks: tasks to show first, see :func:`group_runs`
     :raises FileNotFoundError: one of them does not exist
     :raises RowError: a malformed line, or two different results of the same evaluation in one study
     """
@@ -261,8 +261,8 @@ def group_runs(results: Iterable[Result], tasks: Sequence[str] = ()) -> tuple[li
     """
     Runs by profile and label.
 
-    :param results: in any order
-    :param tasks: shown first and in this order; run or not, where there is no label
+    :param results: results in any order
+    :param tasks: tasks to show first and in this order; without a label also those that were not run
     :return: the groups, and runs left out because they have no final evaluation
     """
     evaluations: dict[RunKey, list[Result]] = {}
@@ -315,7 +315,7 @@ def late_interval(runs: Sequence[Run]) -> Interval | None:
     """
     Late average with Student's interval over runs, as the evaluations of one run repeat the same states.
 
-    :return: cut to [0, 100] for success; None where there was no evaluation during training
+    :return: interval, cut to [0, 100] for success; None where there was no evaluation during training
     """
     values = [value for run in runs if (value := run.value("late")) is not None]
     if not values:

@@ -44,7 +44,7 @@ def student_t(values: Sequence[float] | np.ndarray) -> Interval:
 
 
 def t_interval(mean: float, deviation: float | None, n: int) -> Interval:
-    """The same of values of this mean and sample standard deviation, of which a single value has none."""
+    """The same for n values by their mean and sample standard deviation, which a single value does not have."""
     if not deviation or not deviation > 0:
         return Interval(mean)
     half = stats.t.ppf(0.5 + CONFIDENCE / 2, n - 1) * deviation / math.sqrt(n)
@@ -88,15 +88,15 @@ def bootstrap(
     """
     Percentile interval of a statistic, for a claim about tasks like these and not about these alone.
 
-    Which tasks were chosen is chance as well. So tasks are drawn anew, each with all its combinations since those are of a
+    The choice of tasks is chance as well. So tasks are drawn anew, each with all its combinations since those are of a
     kind, and then runs within each combination (the bootstrap over tasks and runs of Agarwal et al., 2021). It errs on the
     wide side: the runs' own spread is in that of the tasks already. For a single task it is the bootstrap over its runs.
 
-    :param statistic: of as many lists of arrays as are given
-    :param tasks: of each combination
-    :param scores: for each algorithm, one array of runs for each combination
-    :param n_resamples: draws
-    :param seed: of the draws
+    :param statistic: function from as many lists of arrays as are given to a number
+    :param tasks: task of each combination
+    :param scores: scores of each algorithm, one array of runs for each combination
+    :param n_resamples: number of draws
+    :param seed: seed of the draws
     :return: estimate and limits; no limits where a combination has a single run, which would count as exact
     """
     estimate = statistic(*scores)

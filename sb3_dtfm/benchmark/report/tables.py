@@ -66,7 +66,7 @@ def make_report(studies: Sequence[Study], figures: Mapping[tuple[str, str], Mapp
     """
     The whole report.
 
-    :param studies: what to report on, in this order
+    :param studies: studies to report on, in this order
     :param figures: file names by study and title of a group, and by what they show: "scores" beside behaviour cloning,
         "curves" of learning by gradient step or by "minutes", what was "solved" by environment step; each if drawn
     :return: Markdown
@@ -141,8 +141,8 @@ def _task_table(
     """
     A row for each task and share of the data.
 
-    :param columns: what to say of the runs of an algorithm, once for each algorithm
-    :param last: a column at the end, which is told the runs of all algorithms
+    :param columns: name of each column, and function from the runs of an algorithm to its cell; once for each algorithm
+    :param last: name and function of a column at the end, of the runs of all algorithms
     """
     header = ["task", "data", *(f"{algo.upper()} {name}" for name in columns for algo in group.algorithms)]
     rows = []
@@ -155,7 +155,7 @@ def _task_table(
 
 
 def _achieved(group: Group) -> list[str]:
-    """Table in the shape of the paper's."""
+    """A table in the shape of the paper's."""
     text = (
         f"Mean ± standard deviation over seeds: success in percent, or mean return. The late average is the mean of the "
         f"last {N_LATE} evaluations of a run. Seeds of {' / '.join(map(str.upper, group.algorithms))}."
@@ -219,7 +219,7 @@ def _over_seeds(interval: Interval, runs: Sequence[Run]) -> str:
 
 def _bracket(interval: Interval, format_: Callable[[float], str], without: str = "") -> str:
     """
-    :param without: what to say where the data give no interval
+    :param without: text that stands for the interval where the data give none
     """
     limits = without if math.isnan(interval.low) else f" [{format_(interval.low)}, {format_(interval.high)}]"
     return format_(interval.estimate) + limits
@@ -256,7 +256,7 @@ def _share(runs: Sequence[Run], measure: str) -> str:
 
 
 def _scale(runs_of_all: Sequence[Sequence[Run]]) -> str:
-    """The returns that count as 1, and whose they are."""
+    """The returns that score 1, and their sources."""
     runs = [run for each in runs_of_all for run in each]
     scales = dict.fromkeys((run.scale, run.final["data"].get("recorded_from", "not named")) for run in runs)
     named = [f"{_number(scale)} ({_escape(source)})" for scale, source in scales if scale is not None]
