@@ -1,5 +1,5 @@
 """
-What NatureCNN has and ResidualExtractor has not, one change each: docs/studies/images.md.
+Extractors between ResidualExtractor and NatureCNN, one change each: docs/ablations.md.
 
     PYTHONPATH=studies sb3-dtfm benchmark ... --gym-packages extractors \\
         -params "policy_kwargs:dict(flow_draws=8, features_extractor_class='CroppedNatureCNN')"

@@ -95,7 +95,7 @@ two_envs.close()
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory):
-    """What the program prints, which takes as long to start as all that it does."""
+    """Lines that the program prints; its start takes as long as all that it does."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("cameras"))
         result = run_python(SEEN, MUJOCO_GL=BACKEND)
@@ -115,7 +115,7 @@ def test_recorded_images_are_the_observed_ones(told):
 def test_an_evaluation_draws_what_the_policy_looks_at_and_is_the_same(told):
     n_all, lengths, actions, n_needed, lengths_again, actions_again = eval(told[5])  # tuples of numbers
     assert (lengths_again, actions_again) == (lengths, actions)
-    # Of three episodes of ten steps their starts, and each step or the two with which new chunks begin.
+    # Three episodes of ten steps: their starts, and each step or the two with which new chunks begin.
     assert (n_all, n_needed) == (3 + 3 * 10, 3 + 3 * 2)
     assert lengths == [10, 10, 10]
 
