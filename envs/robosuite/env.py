@@ -151,7 +151,7 @@ class RobosuiteEnv(gym.Env[Any, np.ndarray]):
             self._draw()
         if self.render_mode == "human":
             self.render()
-        return self._observe(draw=True), {"is_success": False}
+        return self._observe(), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """
@@ -216,7 +216,7 @@ class RobosuiteEnv(gym.Env[Any, np.ndarray]):
             self._env.close()
             self._env = None
 
-    def _observe(self, draw: bool) -> Any:
+    def _observe(self, draw: bool = True) -> Any:
         """The present observation: (O,) float32, or by key where cameras see it."""
         seen = self._observer()
         if self._cameras is None:
