@@ -1,8 +1,11 @@
 """
 Extractors between ResidualExtractor and NatureCNN, one change each: docs/ablations.md.
 
-    PYTHONPATH=studies sb3-dtfm benchmark ... --gym-packages extractors \\
+    PYTHONPATH=studies MUJOCO_GL=egl sb3-dtfm benchmark --profile studies/images.yml --env robosuite/Lift-v0 --algo dtfm \\
+        --fractions 0.1 --seeds 0 --final-episodes 100 -o mine --gym-packages extractors --label CroppedNatureCNN \\
         -params "policy_kwargs:dict(flow_draws=8, features_extractor_class='CroppedNatureCNN')"
+
+The packaged one's changes are features_extractor_kwargs=dict(crop=1.0) and dict(features_dim=512) there.
 """
 
 from typing import Any
@@ -46,16 +49,12 @@ class FlattenedExtractor(ResidualExtractor):
     def __init__(self, observation_space: spaces.Box, features_dim: int = 64, **kwargs: Any) -> None:
         super().__init__(observation_space, features_dim, **kwargs)
         with th.no_grad():
-            maps = self._maps(th.zeros(1, *observation_space.shape))
-        self.linear = nn.Linear(maps.flatten(1).shape[1], features_dim)
-
-    def _maps(self, observations: th.Tensor) -> th.Tensor:
-        maps: th.Tensor = self.blocks(F.relu(self.stem(self._crop(observations))))
-        return maps
+            maps = self.blocks(self.stem(th.zeros(1, observation_space.shape[0], *self.size)))
+        self.linear = nn.Linear(maps.numel(), features_dim)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Map (N, channels, height, width) to (N, features_dim)."""
-        return self.linear(self._maps(observations).flatten(1))
+        return self.linear(self.blocks(F.relu(self.stem(self._crop(observations)))).flatten(1))
 
 
 EXTRACTORS |= {each.__name__: each for each in (CroppedNatureCNN, FlattenedExtractor)}

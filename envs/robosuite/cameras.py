@@ -36,12 +36,7 @@ class Cameras:
             raise ValueError(f"camera_size must be at least 1, got {size}.")
         self.names = list(names)
         self._model = model
-        try:
-            self._renderer = make_renderer(model, size, size)
-        except mujoco.FatalError as error:
-            raise RuntimeError(
-                f"cameras: MuJoCo cannot draw here ({error}): before Python starts, set MUJOCO_GL to egl or osmesa."
-            ) from error
+        self._renderer = make_renderer(model, size, size)
         self.close = self._renderer.close
         self._option = mujoco.MjvOption()
         self._option.geomgroup[0] = 0  # collision shapes

@@ -283,7 +283,7 @@ class OfflineAlgorithm(SequenceModel):
         :param callback: SB3 callback or list of callbacks
         :param log_interval: number of gradient steps between two logs, None for no logs
         :param tb_log_name: name of the run in TensorBoard, the algorithm's by default
-        :param reset_num_timesteps: whether timesteps are counted from zero; otherwise their count goes on
+        :param reset_num_timesteps: whether timesteps are counted from zero; otherwise they continue
         :param progress_bar: whether to show a progress bar
         :return: the model
         :raises ValueError: no dataset, an argument out of range, or a callback that evaluates in an environment which is not

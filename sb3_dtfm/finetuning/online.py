@@ -131,7 +131,7 @@ class OnlineDTFM(DTFM):
         :param callback: SB3 callback or list of callbacks
         :param log_interval: number of rounds between two logs, None for no logs
         :param tb_log_name: name of the run in TensorBoard, the algorithm's by default
-        :param reset_num_timesteps: whether timesteps are counted from zero; otherwise their count goes on
+        :param reset_num_timesteps: whether timesteps are counted from zero; otherwise they continue
         :param progress_bar: whether to show a progress bar
         :return: the model
         :raises ValueError: no dataset, no environment, or an argument out of range

@@ -124,7 +124,7 @@ def reserve_cache(kept: np.ndarray, n_tokens: int, device: th.device) -> tuple[t
     :param kept: cache that :func:`make_cache` returned, a copy of it, or another array like it
     :param n_tokens: number of tokens that will be appended
     :param device: device of the tokens that will be appended
-    :return: memory with room for them that is nobody else's, and the position where `kept` ends in it
+    :return: memory with room for them that no other call uses, and the position where `kept` ends in it
     """
     with contextlib.suppress(IndexError):
         memory, end = getattr(kept, "behind", []).pop()

@@ -89,6 +89,17 @@ try:
 except KeyboardInterrupt:
     print(len(drawn), [env.unwrapped._draws_images for env in two_envs.envs])
 watched.close()
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from sb3_dtfm.zoo.comparison import N_RANDOM_EPISODES, MeasureRandomActions
+lift = make_vec_env("robosuite/Lift-v0", env_kwargs={"cameras": cameras, "camera_size": 48, "horizon": 10},
+                    wrapper_class=ReturnToGoWrapper, wrapper_kwargs={"target_return": 1.0})
+random = MeasureRandomActions([EvalCallback(lift)], seed=0)
+random.model = one
+drawn.clear()
+random._on_training_start()
+print(len(drawn) - N_RANDOM_EPISODES, one.return_reference.random, lift.envs[0].unwrapped._draws_images)
+lift.close()
 two_envs.close()
 """
 
@@ -100,7 +111,7 @@ def told(tmp_path_factory):
         patch.chdir(tmp_path_factory.mktemp("cameras"))
         result = run_python(SEEN, MUJOCO_GL=BACKEND)
     assert result.returncode == 0, result.stderr
-    return result.stdout.splitlines()[-8:]
+    return result.stdout.splitlines()[-9:]
 
 
 def test_recorded_images_are_the_observed_ones(told):
@@ -121,5 +132,9 @@ def test_an_evaluation_draws_what_the_policy_looks_at_and_is_the_same(told):
 
 
 def test_images_are_drawn_where_anyone_may_look(told):
-    assert told[6] == "33 33"  # a longer context, and a wrapper that nobody knows
+    assert told[6] == "33 33"  # a longer context, and an unknown wrapper
     assert told[7] == "0 [True, True]"  # after an exception
+
+
+def test_random_actions_are_measured_without_drawing_but_at_starts(told):
+    assert told[8] == "1 0.0 True"  # the start after the last episode
