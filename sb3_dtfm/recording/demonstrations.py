@@ -1,10 +1,12 @@
 """Recording scripted demonstrations of robosuite tasks into a robomimic hdf5 file."""
 
 import functools
+import itertools
 import multiprocessing
 import os
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
@@ -109,7 +111,6 @@ def record_demonstrations(
     env_args = _environment(task, (), camera_size).env_args
     env_args["env_kwargs"] |= camera_args(cameras, camera_size)
     attempt = functools.partial(_attempt, scene, seed, noise, pause)
-    limit = n_episodes * ATTEMPTS_PER_EPISODE + 10
     lengths: list[int] = []
     n_attempts = 0
 
@@ -129,7 +130,7 @@ def record_demonstrations(
             f"{pause:g}; nothing is written."
         )
 
-    with closing(_run(attempt, n_workers, limit)) as attempts:
+    with closing(_run(attempt, n_workers, n_episodes)) as attempts:
         write_robomimic(output, successes(attempts), env_args, seed)
     if cameras and n_workers == 1:  # MuJoCo complains of what is still open when Python ends
         _environment(*scene).close()
@@ -141,15 +142,23 @@ def _n_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _run(attempt: Callable[[int], RecordedEpisode], n_workers: int, limit: int) -> Generator[RecordedEpisode, None, None]:
-    """Episodes in the order of attempts."""
+def _run(
+    attempt: Callable[[int], RecordedEpisode], n_workers: int, n_episodes: int
+) -> Generator[RecordedEpisode, None, None]:
+    """Episodes in the order of attempts: `n_episodes`, and another one for each that failed, so that none is left over."""
+    numbers = iter(range(n_episodes * ATTEMPTS_PER_EPISODE + 10))
     if n_workers == 1:
-        yield from map(attempt, range(limit))
+        yield from map(attempt, numbers)
         return
     # Linux forks: the workers then share what is imported already, and scripts need no __main__ guard.
     executor = ProcessPoolExecutor(n_workers, multiprocessing.get_context("fork" if sys.platform == "linux" else None))
     try:
-        yield from executor.map(attempt, range(limit))
+        futures = deque(executor.submit(attempt, number) for number in itertools.islice(numbers, n_episodes))
+        while futures:
+            episode = futures.popleft().result()
+            if not episode.terminated:
+                futures.extend(executor.submit(attempt, number) for number in itertools.islice(numbers, 1))
+            yield episode
     finally:
         executor.shutdown(cancel_futures=True)
 

@@ -36,11 +36,12 @@ EVERYTHING = {
     "flow_prediction": "action",
     "flow_solver": "heun",
     "flow_steps": 2,
+    "n_layers": 1,
 }
 VARIANTS = {
     "dt": (DT, {}),
     "dtfm, one token, chunks and the other options": (DTFM, EVERYTHING),
-    "dtfm, kept keys and values, chunks": (DTFM, {**CHUNKS, "kv_cache": True}),
+    "dtfm, kept keys and values, chunks": (DTFM, {**CHUNKS, "kv_cache": True, "flow_steps": 2}),
     "dtfm": (DTFM, {}),
     "dtfm, one step": (DTFM, {"flow_solver": "one_step"}),
     "dt, one token, chunks": (DT, {**CHUNKS, "tokens_per_step": 1}),

@@ -227,7 +227,7 @@ def test_a_critic_values_what_images_show(buffer):
 def test_the_exported_file_acts_alike(buffer, acting, tmp_path):
     """By the example's loop, as a user would take it."""
     pytest.importorskip("onnxruntime")
-    model = make(DTFM, buffer, policy_kwargs=acting).learn(2)
+    model = make(DTFM, buffer, policy_kwargs=dict(acting, n_layers=1, flow_steps=2)).learn(2)
     model.export(tmp_path / "policy.onnx")
     policy = runpy.run_path(str(DEPLOY))["Policy"](str(tmp_path / "policy.onnx"))
     assert policy.settings["images"] == {CAMERA: [3, 32, 32]}

@@ -56,7 +56,7 @@ class Unknown(gymnasium.Wrapper):
 draw, drawn = Cameras.__call__, []
 Cameras.__call__ = lambda self, data: drawn.append(1) or draw(self, data)
 def made(wrappers, n_envs):
-    settings = {"env_wrapper": wrappers, "env_kwargs": {"cameras": cameras, "camera_size": 48, "horizon": 10}}
+    settings = {"env_wrapper": wrappers, "env_kwargs": {"cameras": cameras, "camera_size": 48, "horizon": 6}}
     return evaluation.make_seeded_envs("robosuite/Lift-v0", settings, n_envs)
 def count(model, envs, as_needed=True):
     # images drawn in three episodes, and what was done in them
@@ -92,7 +92,7 @@ watched.close()
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from sb3_dtfm.zoo.comparison import N_RANDOM_EPISODES, MeasureRandomActions
-lift = make_vec_env("robosuite/Lift-v0", env_kwargs={"cameras": cameras, "camera_size": 48, "horizon": 10},
+lift = make_vec_env("robosuite/Lift-v0", env_kwargs={"cameras": cameras, "camera_size": 48, "horizon": 6},
                     wrapper_class=ReturnToGoWrapper, wrapper_kwargs={"target_return": 1.0})
 random = MeasureRandomActions([EvalCallback(lift)], seed=0)
 random.model = one
@@ -126,13 +126,13 @@ def test_recorded_images_are_the_observed_ones(told):
 def test_an_evaluation_draws_what_the_policy_looks_at_and_is_the_same(told):
     n_all, lengths, actions, n_needed, lengths_again, actions_again = eval(told[5])  # tuples of numbers
     assert (lengths_again, actions_again) == (lengths, actions)
-    # Three episodes of ten steps: their starts, and each step or the two with which new chunks begin.
-    assert (n_all, n_needed) == (3 + 3 * 10, 3 + 3 * 2)
-    assert lengths == [10, 10, 10]
+    # Three episodes of six steps: their starts, and each step or the one with which a new chunk begins.
+    assert (n_all, n_needed) == (3 + 3 * 6, 3 + 3)
+    assert lengths == [6, 6, 6]
 
 
 def test_images_are_drawn_where_anyone_may_look(told):
-    assert told[6] == "33 33"  # a longer context, and an unknown wrapper
+    assert told[6] == "21 21"  # a longer context, and an unknown wrapper
     assert told[7] == "0 [True, True]"  # after an exception
 
 
