@@ -145,7 +145,7 @@ def _n_cores() -> int:
 def _run(
     attempt: Callable[[int], RecordedEpisode], n_workers: int, n_episodes: int
 ) -> Generator[RecordedEpisode, None, None]:
-    """Episodes in the order of attempts: `n_episodes`, and another one for each that failed, so that none is left over."""
+    """Return episodes in their order: `n_episodes`, and another for each failed one, so that none is simulated in vain."""
     numbers = iter(range(n_episodes * ATTEMPTS_PER_EPISODE + 10))
     if n_workers == 1:
         yield from map(attempt, numbers)
@@ -156,8 +156,8 @@ def _run(
         futures = deque(executor.submit(attempt, number) for number in itertools.islice(numbers, n_episodes))
         while futures:
             episode = futures.popleft().result()
-            if not episode.terminated:
-                futures.extend(executor.submit(attempt, number) for number in itertools.islice(numbers, 1))
+            if not episode.terminated and (number := next(numbers, None)) is not None:
+                futures.append(executor.submit(attempt, number))
             yield episode
     finally:
         executor.shutdown(cancel_futures=True)

@@ -137,7 +137,7 @@ def decided(two_ways) -> DTFM:
         "two ways",
     )
     blind.returns_to_go.fill_(0.5)
-    return with_critic(blind).learn(300, log_interval=None)
+    return with_critic(blind).learn(600, log_interval=None)
 
 
 @pytest.mark.parametrize("deterministic", [True, False])

@@ -123,12 +123,12 @@ def hurried(monkeypatch):
 
 
 @pytest.mark.parametrize("n_workers", [1, 2])
-def test_failed_attempts_are_left_out_and_none_is_made_in_vain(n_workers, hurried, tmp_path, monkeypatch):
+def test_failed_episodes_are_left_out_and_none_is_simulated_in_vain(n_workers, hurried, tmp_path, monkeypatch):
     hurried(55)
     environment = demonstrations._environment
 
     def counted(*scene):
-        with (tmp_path / "attempts").open("a") as file:
+        with (tmp_path / "simulated").open("a") as file:
             file.write(".")
         return environment(*scene)
 
@@ -136,7 +136,7 @@ def test_failed_attempts_are_left_out_and_none_is_made_in_vain(n_workers, hurrie
     summary = record_demonstrations("lift", 3, tmp_path / "lift.hdf5", n_workers=n_workers, progress=False)
     buffer = load_robomimic(tmp_path / "lift.hdf5")
     assert summary.n_attempts > 3
-    assert len((tmp_path / "attempts").read_text()) == 1 + summary.n_attempts, "each attempt, and the file's own arguments"
+    assert len((tmp_path / "simulated").read_text()) == 1 + summary.n_attempts, "each episode, and the file's own arguments"
     assert buffer.n_episodes == 3
     assert buffer.terminated.all()
 
